@@ -25,6 +25,13 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 
+def usable_cores() -> int:
+    """Cores that this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 class Workers:
     """`count` processes, started when two or more tasks first need them and kept until the block ends.
 
@@ -68,7 +75,7 @@ class Workers:
                     for position, task in enumerate(tasks)
                 }
             for future in as_completed(futures):
-                yield futures[future], future.result()
+                yield futures.pop(future), future.result()  # results may be large: none is kept
         except BrokenProcessPool:
             raise UserError(
                 "a conversion worker was killed (out of memory?); run again with fewer workers: "

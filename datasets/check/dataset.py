@@ -11,21 +11,27 @@ same motion twice in one split, a licence the manifest does not know, no trainin
 
 Clips that the manifest excludes must be readable; what else is odd about them does not count.
 
-One shard's directory and one clip are in memory at a time, and about 600 bytes for every clip.
+Shards are read by worker processes, one clip at a time; about 2 KB of every clip are kept. A set without
+errors is noted in `.checked.json` beside it, with the sha256 of its manifest and how its files were on the
+disk (`state_of`, which nobody can foretell for another disk): while that is so, `check_once` reads none.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.progress import track
 
+from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.base.json_doors import open_plain
+from motionloom.datasets.base.files import write_json
+from motionloom.datasets.base.pool import Workers
 from motionloom.datasets.base.records import (
     INDEX_FILE,
     REMOVED_FILE,
@@ -35,25 +41,21 @@ from motionloom.datasets.base.records import (
     ShardInfo,
     Split,
 )
-from motionloom.datasets.check.clip import CheckedClip, check_clip
 from motionloom.datasets.check.duplicates import ClipTable
 from motionloom.datasets.check.findings import Findings, Problem
+from motionloom.datasets.check.shard import ShardReport, SoundClip, examine_shard
 from motionloom.datasets.convert.common.removed import Removed
-from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.motion.plausibility import PlausibilityStats, measure
-from motionloom.datasets.shards.checksums import LocalShard, require_intact
-from motionloom.datasets.shards.index import (
-    ShardIndex,
-    SplitIndex,
-    Written,
-    clip_entries,
-    index_path,
-    load_index,
-)
-from motionloom.datasets.shards.reader import load_manifest, manifest_layout
-from motionloom.datasets.shards.tar import TarClip, scan_tar
+from motionloom.datasets.motion.plausibility import FigureMeasure, PlausibilityStats
+from motionloom.datasets.shards.checksums import State, state_of
+from motionloom.datasets.shards.index import SplitIndex, load_index
+from motionloom.datasets.shards.reader import manifest_layout, read_manifest
+from motionloom.datasets.shards.store import LocalStore
 
+CHECKED_FILE = ".checked.json"
+"""Beside the shards of a set in which nothing was wrong."""
+_VERSION = 1
+"""Raised when a check finds more than before."""
 _MOST_FOLDERS = 64
 """Folders of the source that are judged by themselves."""
 _LEAST_CLIPS = 10
@@ -70,12 +72,11 @@ class Figures:
         # Parameters may stay on the floor of their source.
         self._on_zero = layout.family != "raw"
 
-    def add(self, meta: ClipMeta, joints: NDArray[np.floating]) -> None:
-        clip = measure(joints, self._layout.fps)
-        self._all.add(clip)
+    def add(self, meta: ClipMeta, figure: FigureMeasure) -> None:
+        self._all.add(figure)
         folder = meta.source.split("/", 1)[0] if "/" in meta.source else ""
         if folder in self._folders or len(self._folders) < _MOST_FOLDERS:
-            self._folders.setdefault(folder, PlausibilityStats()).add(clip)
+            self._folders.setdefault(folder, PlausibilityStats()).add(figure)
 
     def report(self, root: Path, findings: Findings) -> None:
         oddities = self._all.oddities(floor_at_zero=self._on_zero)
@@ -106,56 +107,85 @@ class CheckReport:
     frames: int
 
 
+class _Checked(Config):
+    """`.checked.json`."""
+
+    version: int
+    manifest: str
+    """Its sha256."""
+    states: dict[str, State]
+    """Each file as it was before it was read."""
+
+
 def check(root: Path) -> list[Problem]:
     """Everything wrong with the dataset in `root`; an empty list when it is sound. Warnings are left out."""
     return examine(root).errors
 
 
-def examine(root: Path, *, progress: bool = False) -> CheckReport:
+def check_once(root: Path, *, workers: int = 1) -> tuple[list[Problem], dict[str, State]]:
+    """(errors, state of each file when it was read); a set that was sound is read again when it changes."""
+    with suppress(UserError):  # no note, or no manifest
+        noted = _Checked.load_json(root / CHECKED_FILE)
+        is_same = (noted.version, noted.manifest) == (_VERSION, read_manifest(LocalStore(root))[1])
+        if is_same and all(state_of(root / name) == state for name, state in noted.states.items()):
+            return [], noted.states
+    report, states = _examine(root, workers, progress=False)
+    return report.errors, states
+
+
+def examine(root: Path, *, workers: int = 1, progress: bool = False) -> CheckReport:
     """Errors and warnings of the dataset in `root`. Never raises for what it finds in the data."""
+    return _examine(root, workers, progress=progress)[0]
+
+
+def _examine(root: Path, workers: int, *, progress: bool) -> tuple[CheckReport, dict[str, State]]:
     try:
-        manifest = load_manifest(root)
+        manifest, digest = read_manifest(LocalStore(root))
         layout = manifest_layout(manifest)
     except UserError as error:
         problem = Problem(str(root), str(error).removeprefix(f"{root}: "))
-        return CheckReport([problem], [], {"manifest": 1}, {}, 0, 0)
+        return CheckReport([problem], [], {"manifest": 1}, {}, 0, 0), {}
     findings = Findings()
-    frames = 0
+    states = {name: state_of(root / name) for name in (INDEX_FILE, REMOVED_FILE)}
     _stray_files(root, manifest, findings)
     table = ClipTable(root, manifest.shards, layout)
     figures = Figures(layout)
     widths: dict[int, str] = {}
     removed = Removed.of(root)
-    for number, shard in enumerate(track(manifest.shards, "checking shards", disable=not progress)):
-        indexed = _indexed_present(root / shard.name)
-        try:
-            for row, place, clip in _checked_clips(root / shard.name, shard, layout, findings):
-                where = f"{shard.name}: '{place.key}'"
-                if row < len(indexed) and indexed[row] != clip.meta.present:
-                    findings.error("index", where, "has_hands or has_face is not what the index says")
-                frames += clip.meta.frames
-                if removed.has(clip.meta.id, clip.meta.source):
-                    findings.error("removed", where, f"in {REMOVED_FILE}; give data remove again")
-                if clip.meta.id in manifest.excluded:
-                    continue
-                joints = joints_of(clip.motion, layout)
-                table.add(number, place, clip.meta, joints)
-                figures.add(clip.meta, joints)
-                for fault in clip.meta.faults or ():
-                    findings.warn("doubtful motion", where, f"{fault.kind}: {fault.text}")
-                for kind, message in clip.oddities:
-                    findings.warn(kind, where, message)
-                _against_manifest(where, clip, manifest, widths, findings)
-        except (UserError, OSError) as error:
-            findings.error("tar", shard.name, str(error).removeprefix(f"{root / shard.name}: "))
+    indices: dict[Split, list[SplitIndex]] = {split: [] for split in SPLITS}
+    frames = 0
+    reports = _in_order(manifest.shards, root, layout, workers)
+    total = len(manifest.shards)
+    for number, report in enumerate(track(reports, "checking shards", total, disable=not progress)):
+        shard = manifest.shards[number]
+        states |= report.states
+        for kind, where, message in report.errors:
+            findings.error(kind, where, message)
+        if report.index is not None:
+            indices[shard.split].append(report.index)
+        for clip in report.clips:
+            where = f"{shard.name}: '{clip.key}'"
+            frames += clip.meta.frames
+            if removed.has(clip.meta.id, clip.meta.source):
+                findings.error("removed", where, f"in {REMOVED_FILE}; give data remove again")
+            if clip.meta.id in manifest.excluded:
+                continue
+            table.add(number, clip.key, clip.motion, clip.meta, clip.signature)
+            figures.add(clip.meta, clip.figure)
+            for kind, message in clip.oddities:
+                findings.warn(kind, where, message)
+            _against_manifest(where, clip, manifest, widths, findings)
     table.report(findings)
     figures.report(root, findings)
     if not any(shard.split == "train" for shard in manifest.shards):
         findings.warn("no training split", str(root), "no clips in split 'train'")
     for split in SPLITS:
         shards = [shard for shard in manifest.shards if shard.split == split]
-        if shards:
-            _check_index(root, split, shards, findings)
+        if shards and len(indices[split]) == len(shards):
+            _check_index(root, split, shards, indices[split], findings)
+    if not findings.error_kinds:
+        with suppress(OSError):  # a folder that may only be read is checked in each run
+            write_json(root / CHECKED_FILE, _Checked(version=_VERSION, manifest=digest, states=states).dump())
     return CheckReport(
         findings.all_errors(str(root)),
         findings.all_warnings(str(root)),
@@ -163,48 +193,36 @@ def examine(root: Path, *, progress: bool = False) -> CheckReport:
         dict(findings.warning_kinds),
         len(table),
         frames,
-    )
+    ), states
+
+
+def _in_order(
+    shards: Sequence[ShardInfo], root: Path, layout: MotionLayout, workers: int
+) -> Iterator[ShardReport]:
+    """The shards' reports, whichever process is done first."""
+    waiting: dict[int, ShardReport] = {}
+    given = 0
+    # A process takes seconds to start: as long as a few shards.
+    with Workers(min(workers, len(shards) // 4)) as pool:
+        for position, report in pool.run(partial(examine_shard, root=root, layout=layout), shards):
+            waiting[position] = report
+            while given in waiting:
+                yield waiting.pop(given)
+                given += 1
 
 
 def _stray_files(root: Path, manifest: Manifest, findings: Findings) -> None:
     listed = [shard.name for shard in manifest.shards]
-    for name in sorted({name for name in listed if listed.count(name) > 1}):
-        findings.error("manifest", name, "listed twice in the manifest")
+    for name, times in sorted(Counter(listed).items()):
+        if times > 1:
+            findings.error("manifest", name, "listed twice in the manifest")
     for path in sorted(root.glob("*.tar")):
         if path.name not in listed:
             findings.error("manifest", path.name, "not in the manifest; delete it or convert again")
 
 
-def _checked_clips(
-    path: Path, shard: ShardInfo, layout: MotionLayout, findings: Findings
-) -> Iterator[tuple[int, TarClip, CheckedClip]]:
-    """(row, place, clip) of every sound clip of one shard; what is wrong on the way goes to `findings`."""
-    try:
-        require_intact(LocalShard(path, shard))
-    except UserError as error:
-        findings.error("shard", shard.name, str(error).removeprefix(f"{path}: "))
-        if not path.exists():
-            return
-    clips = scan_tar(path, most=shard.samples)
-    if len(clips) != shard.samples:
-        findings.error("shard", shard.name, f"{len(clips)} samples, the manifest says {shard.samples}")
-    frames = 0
-    with open_plain(path) as file:
-        for row, clip in enumerate(clips):
-            try:
-                checked = check_clip(file, path, clip, shard, layout)
-            except (UserError, ValueError) as error:
-                message = str(error).removeprefix(f"{path}: ")
-                findings.error("clip", f"{shard.name}: '{clip.key}'", message)
-                continue
-            frames += checked.meta.frames
-            yield row, clip, checked
-    if frames != shard.frames:
-        findings.error("shard", shard.name, f"{frames} sound frames, the manifest says {shard.frames}")
-
-
 def _against_manifest(
-    where: str, clip: CheckedClip, manifest: Manifest, widths: dict[int, str], findings: Findings
+    where: str, clip: SoundClip, manifest: Manifest, widths: dict[int, str], findings: Findings
 ) -> None:
     licence = clip.meta.licence
     if licence not in {manifest.licence, *manifest.licences}:
@@ -217,20 +235,11 @@ def _against_manifest(
             findings.error("audio", where, other)
 
 
-def _indexed_present(path: Path) -> list[int]:
-    """Return what a shard's index states of its clips; an unreadable index is reported with the indices."""
-    try:
-        return [clip.held for clip in ShardIndex.load_json(index_path(path)).clips]
-    except (UserError, OSError):
-        return []
-
-
-def _check_index(root: Path, split: Split, shards: list[ShardInfo], findings: Findings) -> None:
-    before = findings.error_kinds["index"]
-    # A generator: the JSON indices of a large split would not fit into memory together.
-    rebuilt = SplitIndex.build(_sound_indices(root, shards, findings))
-    if findings.error_kinds["index"] > before:
-        return
+def _check_index(
+    root: Path, split: Split, shards: list[ShardInfo], indices: list[SplitIndex], findings: Findings
+) -> None:
+    """Compare `index.npz` with the shards' own indices."""
+    rebuilt = SplitIndex.join(indices)
     try:
         flat = load_index(root, split, shards)
     except UserError as error:
@@ -241,19 +250,3 @@ def _check_index(root: Path, split: Split, shards: list[ShardInfo], findings: Fi
     ):
         other = f"split '{split}' says something else than the shards' own indices"
         findings.error("index", INDEX_FILE, other)
-
-
-def _sound_indices(root: Path, shards: list[ShardInfo], findings: Findings) -> Iterator[ShardIndex]:
-    for shard in shards:
-        path = root / shard.name
-        try:
-            stored = ShardIndex.load_json(index_path(path))
-            written = [Written(clip.id, clip.held, clip.source, clip.made_from) for clip in stored.clips]
-            entries = clip_entries(path, written)
-        except (UserError, OSError, ValueError) as error:
-            findings.error("index", index_path(path).name, f"does not fit its tar: {error}")
-            continue
-        if stored.shard != shard or stored.clips != entries:
-            findings.error("index", index_path(path).name, "other contents than the tar or the manifest")
-            continue
-        yield stored

@@ -28,7 +28,7 @@ from motionloom.datasets.motion.canonical import facing, ground, mirror, resampl
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.shards.tar import TarClip, npy_from_bytes
+from motionloom.datasets.shards.tar import npy_from_bytes
 
 SAME_METRES = 0.008
 """Mean distance of joints, seen from the figure, below which two seconds are of one recording."""
@@ -77,11 +77,12 @@ class ClipTable:
     def __len__(self) -> int:
         return len(self._clips)
 
-    def add(self, shard: int, clip: TarClip, meta: ClipMeta, joints: NDArray[np.floating]) -> None:
-        """Remember a clip of shard number `shard`, with joints [T, N, 3]."""
-        motion = clip.members["motion.npy"]
-        self._clips.append(_Seen(meta.id, meta.mirror_of or meta.id, shard, clip.key, motion))
-        self._signatures.append(signature(joints, self.layout.fps))
+    def add(
+        self, shard: int, key: str, motion: tuple[int, int], meta: ClipMeta, signed: NDArray[np.float32]
+    ) -> None:
+        """Remember a clip of shard number `shard` with its `signature`; `motion` as in `_Seen`."""
+        self._clips.append(_Seen(meta.id, meta.mirror_of or meta.id, shard, key, motion))
+        self._signatures.append(signed)
 
     def report(self, findings: Findings) -> None:
         first: dict[str, _Seen] = {}

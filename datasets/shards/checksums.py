@@ -16,6 +16,8 @@ from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.base.json_doors import require_plain
 from motionloom.datasets.base.records import ShardInfo
 
+State = list[int]
+"""Size, times and inode of a file (`state_of`)."""
 _ADVICE = "copy it back or convert again"
 
 
@@ -25,11 +27,11 @@ class LocalShard(NamedTuple):
     path: Path
     info: ShardInfo
 
-    def state(self) -> list[int]:
+    def state(self) -> State:
         return state_of(self.path)
 
 
-def state_of(path: Path) -> list[int]:
+def state_of(path: Path) -> State:
     """Return size, times and inode, which change when somebody writes or replaces a file; empty without one.
 
     The time of the last change of any kind (ctime) is the system's own: a copy that restores the time of the

@@ -21,7 +21,7 @@ Arrays, n clips of a split and M = `len(MEMBERS)`:
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -36,7 +36,7 @@ from motionloom.datasets.base.json_doors import open_plain
 from motionloom.datasets.base.records import INDEX_FILE, PRESENT_ALL, Dropped, ShardInfo, Split
 from motionloom.datasets.motion.npz import NpzFile, read_npy_header
 from motionloom.datasets.shards.sample import MEMBERS
-from motionloom.datasets.shards.tar import scan_tar
+from motionloom.datasets.shards.tar import TarClip, scan_tar
 
 _ARRAYS: dict[str, tuple[type[np.generic], int]] = {
     "frames": (np.int32, 1),
@@ -99,24 +99,31 @@ def index_path(tar: Path) -> Path:
     return tar.with_name(tar.name.removesuffix(".tar") + ".index")
 
 
-def clip_entries(path: Path, written: list[Written]) -> list[ClipEntry]:
+def clip_entries(path: Path, written: Sequence[Written]) -> list[ClipEntry]:
     """Return the index rows of a tar on disk; `written` holds further facts of its clips, in order."""
-    entries = []
     with open_plain(path) as file:
-        for clip, about in zip(scan_tar(path), written, strict=True):
-            start, size = clip.members["motion.npy"]
-            file.seek(start)
-            header = read_npy_header(file, f"{path}: '{clip.key}.motion.npy'", size)
-            entries.append(
-                ClipEntry(
-                    key=clip.key,
-                    **about._asdict(),
-                    frames=header.shape[0],
-                    motion_data=start + header.start,
-                    motion_itemsize=header.dtype.itemsize,
-                    members=clip.members,
-                )
+        return entries_of(file, path, scan_tar(path), written)
+
+
+def entries_of(
+    file: BinaryIO, path: Path, clips: Sequence[TarClip], written: Sequence[Written]
+) -> list[ClipEntry]:
+    """The same of an open tar whose clips are known; `ValueError` where `written` has others."""
+    entries = []
+    for clip, about in zip(clips, written, strict=True):
+        start, size = clip.members["motion.npy"]
+        file.seek(start)
+        header = read_npy_header(file, f"{path}: '{clip.key}.motion.npy'", size)
+        entries.append(
+            ClipEntry(
+                key=clip.key,
+                **about._asdict(),
+                frames=header.shape[0],
+                motion_data=start + header.start,
+                motion_itemsize=header.dtype.itemsize,
+                members=clip.members,
             )
+        )
     return entries
 
 
@@ -142,37 +149,40 @@ class SplitIndex:
 
     @staticmethod
     def build(shards: Iterable[ShardIndex]) -> SplitIndex:
-        """Concatenate the shards of one split. Only flat arrays are kept, so a million clips fit."""
-        parts: dict[str, list[NDArray]] = {name: [] for name in _ARRAYS}
-        end = 0
-        for shard in shards:
-            # Ids lie one after the other as bytes: an array of text takes the longest one's room for each.
-            ids = [entry.id.encode() for entry in shard.clips]
-            ends = end + np.cumsum([len(source) for source in ids], dtype=np.int64)
-            end = int(ends[-1]) if len(ends) else end
-            places = np.array(
-                [[entry.members.get(name, (0, 0)) for name in MEMBERS] for entry in shard.clips],
-                dtype=np.int64,
-            ).reshape(len(ids), len(MEMBERS), 2)
-            columns = {
-                "frames": [entry.frames for entry in shard.clips],
-                "data": [entry.motion_data for entry in shard.clips],
-                "itemsize": [entry.motion_itemsize for entry in shard.clips],
-                "held": [entry.held for entry in shard.clips],
-                "offsets": places[..., 0],
-                "sizes": places[..., 1],
-                "id_ends": ends,
-                "id_bytes": np.frombuffer(b"".join(ids), dtype=np.uint8),
-            }
-            for name, values in columns.items():
-                parts[name].append(np.asarray(values, dtype=_ARRAYS[name][0]))
-        empty = {name: (0,) if rank == 1 else (0, len(MEMBERS)) for name, (_, rank) in _ARRAYS.items()}
+        """The shards of one split. Only flat arrays are kept, so a million clips fit."""
+        return SplitIndex.join(map(SplitIndex.of, shards))
+
+    @staticmethod
+    def of(shard: ShardIndex) -> SplitIndex:
+        """The arrays of one shard."""
+        # Ids lie one after the other as bytes: an array of text takes the longest one's room for each.
+        ids = [entry.id.encode() for entry in shard.clips]
+        places = np.array(
+            [[entry.members.get(name, (0, 0)) for name in MEMBERS] for entry in shard.clips], dtype=np.int64
+        ).reshape(len(ids), len(MEMBERS), 2)
+        columns = {
+            "frames": [entry.frames for entry in shard.clips],
+            "data": [entry.motion_data for entry in shard.clips],
+            "itemsize": [entry.motion_itemsize for entry in shard.clips],
+            "held": [entry.held for entry in shard.clips],
+            "offsets": places[..., 0],
+            "sizes": places[..., 1],
+            "id_ends": np.cumsum([len(source) for source in ids]),
+            "id_bytes": np.frombuffer(b"".join(ids), dtype=np.uint8),
+        }
         return SplitIndex(
-            **{
-                name: np.concatenate([np.zeros(empty[name], dtype=_ARRAYS[name][0]), *values])
-                for name, values in parts.items()
-            }
+            **{name: np.asarray(columns[name], dtype=kind) for name, (kind, _) in _ARRAYS.items()}
         )
+
+    @staticmethod
+    def join(shards: Iterable[SplitIndex]) -> SplitIndex:
+        """The arrays of several shards as one."""
+        empty = SplitIndex.of(ShardIndex(fingerprint="", shard=None, clips=[], dropped=[]))
+        parts = [empty, *shards]
+        joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
+        before = np.cumsum([0, *(len(part.id_bytes) for part in parts[:-1])])
+        joined["id_ends"] += np.repeat(before, [len(part) for part in parts])
+        return SplitIndex(**joined)
 
 
 def save_index(root: Path, splits: dict[Split, SplitIndex]) -> None:

@@ -128,12 +128,13 @@ def check(
 
     Example: `motionloom data check shards`
     """
+    from motionloom.datasets.base.pool import usable_cores
     from motionloom.datasets.check.dataset import examine
 
     console = make_console(aside=as_json)
     if not root.exists():
         raise UserError(f"{root}: no such folder")
-    report = examine(root, progress=console.is_terminal)
+    report = examine(root, workers=usable_cores(), progress=console.is_terminal)
     for title, problems in (("warning: ", report.warnings), ("", report.errors)):
         findings = [Dropped(source=problem.where, reason=problem.message) for problem in problems]
         for group in grouped(findings):

@@ -18,6 +18,7 @@ from pydantic import Field, field_validator
 
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.pool import usable_cores
 from motionloom.pipeline.launch.cluster import ClusterOptions
 from motionloom.pipeline.launch.process import local_rank
 
@@ -158,13 +159,6 @@ def require_loggers(names: Sequence[LoggerName]) -> None:
             raise UserError(
                 f"hardware.loggers names {name}, which is not installed: pip install 'motionloom[{name}]'"
             )
-
-
-def usable_cores() -> int:
-    """Cores that this process may run on."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 FEW = 8

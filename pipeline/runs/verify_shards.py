@@ -2,20 +2,22 @@
 
 What has been compared is noted in `.compared.json` of the run folder, so the next stage, and the same command
 after a kill, only looks whether the files are as they were. The first process of each machine compares, since
-another machine may have a copy of its own.
+another machine may have a copy of its own; machines that see one file (the same path, inode and times) divide
+the work.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
 
+from motionloom.datasets.base.pool import usable_cores
 from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.shards.checksums import LocalShard, problems
 from motionloom.pipeline.contract.stage import StageContext
-from motionloom.pipeline.launch.hardware import usable_cores
 from motionloom.pipeline.launch.process import JointError, local_rank
 from motionloom.pipeline.launch.team import Team
 from motionloom.pipeline.store.artifact import NOTE, Compared
@@ -56,10 +58,17 @@ def compare_shards(
         for shard in shards
         if local_rank() == 0 and not known.knows(str(shard.path), shard.info.sha256, state := shard.state())
     ]
+    # Every process knows who is to compare which file, and takes its turn at those that several see.
+    seen = defaultdict[tuple[object, ...], list[int]](list)
+    for rank, files in enumerate(team.gather([(str(shard.path), *state) for shard, state in todo])):
+        for file in files:
+            seen[file].append(rank)
+    turns = {file: ranks[at % len(ranks)] for at, (file, ranks) in enumerate(seen.items())}
+    mine = [shard for shard, state in todo if turns[str(shard.path), *state] == team.rank]
     mistakes: list[str] = []
-    if todo:
-        with Meter("comparing shards", len(todo), console=console) as meter:
-            mistakes = problems([shard for shard, _ in todo], min(_THREADS, usable_cores()), meter.advance)
+    if mine:
+        with Meter("comparing shards", len(mine), console=console) as meter:
+            mistakes = problems(mine, min(_THREADS, usable_cores()), meter.advance)
     # Gathered, so that every process refuses, and none waits for one that has.
     wrong = [message for own in team.gather(mistakes) for message in own]
     if wrong:
@@ -67,4 +76,4 @@ def compare_shards(
         raise JointError(f"{wrong[0]}{more}")
     if todo:
         Compared.add(record, {str(shard.path): (shard.info.sha256, state) for shard, state in todo})
-    return sum(shard.info.bytes for shard, _ in todo)
+    return sum(shard.info.bytes for shard in mine)

@@ -22,7 +22,7 @@ from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.base.json_doors import parse_json, read_plain
 from motionloom.datasets.base.licences import UNKNOWN, strictest
 from motionloom.datasets.base.lock import LOCK_FILE, file_lock
-from motionloom.datasets.shards.checksums import state_of
+from motionloom.datasets.shards.checksums import State, state_of
 from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.run_folder import STAGE_NAME, identity_of, in_export, owner_of, stage_folder
 
@@ -212,7 +212,6 @@ def fingerprint_now(folder: Path) -> str | None:
 
 NOTE = ".compared.json"
 
-State = list[int]
 _MACHINES = 64
 """States of a file that are noted."""
 

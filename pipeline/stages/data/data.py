@@ -12,7 +12,7 @@ from motionloom.datasets.audio.beat_net import WEIGHTS
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.base.records import Manifest
-from motionloom.datasets.check.dataset import check
+from motionloom.datasets.check.dataset import check_once
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.shards.cache import CacheConfig
 from motionloom.datasets.shards.left_out import tally
@@ -30,8 +30,10 @@ from motionloom.pipeline.contract.stage import (
     StageContext,
     register,
 )
+from motionloom.pipeline.store.artifact import NOTE, Compared
 from motionloom.pipeline.store.data import READER, REFERENCE, SHARDS, Data, DataPreview, Reader, Reference
 from motionloom.pipeline.store.files import write_json
+from motionloom.pipeline.store.run_folder import owner_of
 
 
 class DataStage(FunctionStage):
@@ -139,11 +141,14 @@ def run_shards(context: StageContext) -> None:
     (manifest, _) = config.manifest()
     place = config.place
     if config.verify and not is_url(place):
-        problems = check(Path(place))
+        problems, states = check_once(Path(place), workers=context.hardware.convert_workers)
         if problems:
             raise UserError(
                 f"{place}: {len(problems)} problems, first: {problems[0]}; see: motionloom data check"
             )
+        # What has been hashed is not hashed again by the next stage.
+        compared = {str(Path(place, one.name)): (one.sha256, states[one.name]) for one in manifest.shards}
+        Compared.add(owner_of(context.folder) / NOTE, compared)
     say_shards(context, manifest)
     size = sum(shard.bytes for shard in manifest.shards if shard.split == "train")
     if is_url(place) and config.order == "global" and 0 < config.cache.limit < size:

@@ -19,7 +19,8 @@ from shard_samples import LAYOUT, write_made
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.records import Caption, Split
-from motionloom.datasets.check.dataset import CheckReport, examine
+from motionloom.datasets.check import dataset
+from motionloom.datasets.check.dataset import CheckReport, check_once, examine
 from motionloom.datasets.check.findings import LISTED, Findings
 from motionloom.datasets.check.leaks import find_leaks
 from motionloom.datasets.motion.canonical import canonicalize, mirror
@@ -92,7 +93,7 @@ def test_the_same_motion_twice(tmp_path: Path) -> None:
 def test_many_recordings_in_two_splits(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A shard's headers are read for its clips and its index; many findings are one sentence on the first."""
+    """A shard's headers are read once, and many findings are one sentence on the first."""
     motions = [features(seed) * np.float32(1 + 1e-6 * copy) for copy in range(2) for seed in range(7)]
     halves: list[Split] = ["train"] * 7 + ["test"] * 7
     pairs = enumerate(zip(halves, motions, strict=True))
@@ -101,9 +102,37 @@ def test_many_recordings_in_two_splits(
     read, whole = Counter[str](), shards._entries
     monkeypatch.setattr(shards, "_entries", lambda *of: (read.update([of[0].name]), whole(*of))[1])
     assert app(["data", "check", str(tmp_path)], standalone_mode=False) == 1
-    assert set(read.values()) == {2} and len(read) == 2
+    assert set(read.values()) == {1} and len(read) == 2
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "same recording" in line]
     assert "…" not in line and "6 more" in line and "'train'" in line
+
+
+def test_processes_find_what_one_finds_and_a_sound_set_is_read_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = [Made(f"c{at}", ("train", "test")[at % 2], features(at)) for at in range(9)]
+    sound = write_made(tmp_path / "a", [(one.split, one) for one in made], convert, clips_per_shard=1)
+    odd = [*made, Made("c9", "test", features(0)), Made("c10", texts=(), licence="none")]
+    items = [(one.split, one) for one in odd]
+    broken = write_made(tmp_path / "b", items, convert, describe=lambda clip: clip.id, clips_per_shard=1)
+    (broken / "made-train-000000.tar").write_bytes(b"no tar")
+    one, several = (examine(broken, workers=workers) for workers in (1, 2))
+    assert one == several and len(one.errors) >= 2 and len(one.warnings) >= 2
+    assert not (broken / dataset.CHECKED_FILE).exists()
+    read: list[str] = []
+    look = dataset.examine_shard
+    monkeypatch.setattr(
+        dataset, "examine_shard", lambda shard, **of: (read.append(shard.name), look(shard, **of))[1]
+    )
+    problems, states = check_once(sound)
+    assert not problems and len(read) == 9 and states.keys() >= set(read)
+    assert check_once(sound) == ([], states) and len(read) == 9
+    for name in (read[4], "index.npz", "manifest.json"):
+        before = len(read)
+        (sound / name).touch()
+        if name == "manifest.json":
+            (sound / name).write_text((sound / name).read_text() + " ")
+        assert check_once(sound)[0] == [] and len(read) == before + 9, f"{name} was written anew"
 
 
 def test_a_mirror_image_that_does_not_say_so(tmp_path: Path) -> None:

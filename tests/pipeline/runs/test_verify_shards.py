@@ -11,11 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import shard_samples
 from rich.console import Console
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.base.records import ShardInfo
+from motionloom.datasets.shards import checksums
 from motionloom.datasets.shards.checksums import LocalShard
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import JointError
@@ -126,6 +128,21 @@ def test_the_first_process_of_each_machine_compares_and_all_refuse(
     assert compare_shards(shards, record, Team(), QUIET) == 0
 
 
+def test_machines_that_see_one_disk_divide_its_shards(
+    shards: list[LocalShard], tmp_path: Path, compared: list[list[str]]
+) -> None:
+    class One(Team):
+        """A team whose first three machines share a disk; the fourth has a copy."""
+
+        def gather(self, mine: Any) -> list[Any]:
+            shared = mine and isinstance(mine[0], tuple)
+            return [mine, mine, mine, [(*file[:-1], -1) for file in mine]] if shared else [mine]
+
+    read = [compare_shards(shards, tmp_path / f"{rank}.json", One(rank, 4), QUIET) for rank in range(3)]
+    assert sum(read) == sum(shard.info.bytes for shard in shards) and min(read)
+    assert compared == [["000000", "000003"], ["000001", "000004"], ["000002"]]
+
+
 def test_processes_look_when_all_are_here(
     shards: list[LocalShard], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -151,6 +168,19 @@ stages:
   data: {kind: synth, clips: 8}
   stats: {kind: stats}
 """
+
+
+def test_a_run_hashes_shards_of_others_once_and_the_next_run_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shard_samples.write(tmp_path / "set", clips_per_shard=20)
+    recipe = tmp_path / "x.yaml"
+    recipe.write_text(RECIPE.replace("kind: synth, clips: 8", f"kind: shards, path: {tmp_path / 'set'}"))
+    hashed: list[str] = []
+    monkeypatch.setattr(checksums, "sha256_of", lambda path: (hashed.append(path.name), sha256_of(path))[1])
+    for run in ("one", "another"):
+        run_recipe(recipe, tmp_path / run, console=QUIET)
+        assert sorted(hashed) == sorted(path.name for path in (tmp_path / "set").glob("*.tar"))
 
 
 def test_a_stage_does_not_begin_on_damaged_shards(tmp_path: Path) -> None:
