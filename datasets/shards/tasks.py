@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import platform
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -70,9 +70,10 @@ def plan_shards(
 ) -> list[ShardTask[T]]:
     """Return the shards with their items in order: known before the first one is converted.
 
-    With `depends_on`, which returns an item's content, items are ordered by a hash of their names: they keep
-    their neighbours when others come and go, so that a new shard takes its clips from few old ones. `removed`
-    items leave their places empty, so that no other item moves to another shard.
+    With `depends_on`, which returns an item's content, a shard takes the items whose names have hashes that
+    begin with some bits, and its number says which: a full one is split by the next bit. So an item that
+    comes or goes changes its own shard alone, whatever the order in which a set has grown. `removed` items
+    leave their places empty, so that no other item moves to another shard.
     """
     tasks: list[ShardTask[T]] = []
     made_from = sha256_of_json(facts.made_from())
@@ -83,14 +84,17 @@ def plan_shards(
         names = [describe(item) for item in members]
         if depends_on is None:
             order = permutation(len(members), how.seed, position).tolist()
-            content: list[object] = [None] * len(members)
+            firsts = range(0, len(members), how.clips_per_shard)
+            shards = [(at, order[first : first + how.clips_per_shard]) for at, first in enumerate(firsts)]
         else:
-            order = sorted(range(len(members)), key=lambda i: sha256_of_json([how.seed, names[i]]))
-            content = [depends_on(item) for item in members]
+            hashed = sorted((int(sha256_of_json([how.seed, name]), 16), i) for i, name in enumerate(names))
+            shards = list(_by_prefix(hashed, how.clips_per_shard))
         # A fingerprint hashes all that a shard's bytes depend on: a later run keeps the shards that fit.
-        for number, first in enumerate(range(0, len(members), how.clips_per_shard)):
-            places = order[first : first + how.clips_per_shard]
-            digests = {i: sha256_of_json([made_from, split, names[i], content[i]]) for i in places}
+        for number, places in shards:
+            digests = {}
+            for i in places:
+                content = None if depends_on is None else depends_on(members[i])
+                digests[i] = sha256_of_json([made_from, split, names[i], content])
             chosen = tuple(ShardItem(names[i], digests[i], members[i]) for i in places if i < present)
             fingerprint = sha256_of_json([facts.name, split, number, list(digests.values())])
             fingerprint = without(fingerprint, (digests[i] for i in places if i >= present))
@@ -101,6 +105,22 @@ def plan_shards(
                 )
             )
     return tasks
+
+
+def _by_prefix(
+    hashed: Sequence[tuple[int, int]], most: int, number: int = 0, bit: int = 255
+) -> Iterator[tuple[int, list[int]]]:
+    """(number, items) of shards of at most `most` of the sorted (hash, item), in their order.
+
+    Shards are the leaves of a tree: number n, when full, becomes 2 n + 1 and 2 n + 2 by a bit of the hashes.
+    """
+    if len(hashed) <= most or bit < 0:  # the latter: items of one name
+        yield number, [item for _, item in hashed]
+        return
+    half = sum(not value >> bit & 1 for value, _ in hashed)
+    for child, part in ((2 * number + 1, hashed[:half]), (2 * number + 2, hashed[half:])):
+        if part:
+            yield from _by_prefix(part, most, child, bit - 1)
 
 
 def without(fingerprint: str, removed: Iterable[str]) -> str:

@@ -31,7 +31,7 @@ from motionloom.datasets.loading.plan import BatchPlan, Share
 from motionloom.datasets.shards import tasks
 from motionloom.datasets.shards.clips import Source
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, kind_of_reason, tally, write_left_out
-from motionloom.datasets.shards.options import Part
+from motionloom.datasets.shards.options import Part, WriteOptions
 from motionloom.datasets.shards.reader import ShardDataset
 
 
@@ -65,6 +65,29 @@ def test_clips_are_shuffled_over_shards_by_the_seed(made: ModuleType, tmp_path: 
     in_order = [f"clip-ä-{i}" for split, i in made.items(60) if split == "train"]
     assert sorted(one) == sorted(other) == sorted(in_order)
     assert one != other and one != in_order
+
+
+def test_ten_new_clips_touch_ten_shards(made: ModuleType) -> None:
+    """Whatever the order in which a set grows, its shards are the same, and each is a prefix of the hash."""
+
+    def planned(count: int) -> dict[str, tuple[str, set[str]]]:
+        how = WriteOptions(clips_per_shard=16)
+        items = made.items(count)
+        shards = tasks.plan_shards(Path(), items[::-1], made.facts(), how, str, str)
+        assert sorted(item.item for one in shards for item in one.items) == [*range(count)]
+        assert max(len(one.items) for one in shards) <= 16 and len({one.path for one in shards}) == len(
+            shards
+        )
+        assert len(shards) < 2 * count / 16
+        return {one.path.name: (one.fingerprint, {item.name for item in one.items}) for one in shards}
+
+    before, after = planned(3000), planned(3010)
+    touched = {name for name, shard in before.items() if after.get(name) != shard}
+    assert len(touched) <= 10 and len(after.keys() - before.keys()) <= 2 * len(before.keys() - after.keys())
+    for name in before.keys() - after.keys():
+        split, number = name.removesuffix(".tar").rsplit("-", 1)
+        halves = [after[f"{split}-{2 * int(number) + bit:06d}.tar"][1] for bit in (1, 2)]
+        assert before[name][1] <= halves[0] | halves[1], "a full shard is split in two"
 
 
 SCRIPT = """
