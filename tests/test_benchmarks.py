@@ -57,6 +57,17 @@ def test_a_benchmark_can_be_loaded(script: Path, monkeypatch: pytest.MonkeyPatch
     assert f"{script.parent.name}/{script.name}" in module.__doc__, "its command stands in its docstring"
 
 
+@pytest.mark.parametrize("clips", [1000, 4000])
+def test_what_grows_with_a_set_grows_by_what_it_must(
+    clips: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    growth = loaded(FOLDER / "growth.py", monkeypatch)
+    monkeypatch.setattr(growth, "SHARD", 16)
+    monkeypatch.setattr(growth, "BATCH", 32)
+    found = growth.counts(growth.made(tmp_path, clips))
+    assert not {name: value for name, value in found.items() if value > growth.MOST[name]}
+
+
 def test_a_models_card_is_measured_on_the_clips_that_a_run_would_hold_back(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
