@@ -163,9 +163,10 @@ def accuracy_among(
     text = F.normalize(text.double(), dim=-1)
     candidates = torch.cat([torch.arange(len(motion))[:, None], others], dim=1).to(motion.device)
     ranked = []
-    for some, rows in zip(motion.split(_ROWS), candidates.split(_ROWS), strict=True):
+    for first in range(0, len(motion), _ROWS):
+        rows = slice(first, first + _ROWS)
         # Products are summed alike for every candidate, so that equal texts are exactly as near.
-        near = (text[rows] * some[:, None]).sum(-1).nan_to_num(nan=-1.0)
+        near = (text[candidates[rows]] * motion[rows, None]).sum(-1).nan_to_num(nan=-1.0)
         own = near[:, :1]
         rest = near[:, 1:]
         ranked.append((rest > own).sum(1) + 0.5 * (rest == own).sum(1))

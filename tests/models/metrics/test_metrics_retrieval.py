@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from motionloom.models.metrics import retrieval
 from motionloom.models.metrics.distributions import diversity, fid, frechet_distance, multimodality
 from motionloom.models.metrics.retrieval import (
-    Distance,
     accuracy_among,
     matching_score,
     other_texts,
@@ -52,6 +51,13 @@ def test_what_is_no_number_is_found_last() -> None:
     assert accuracy_among(lost, text, other_texts(torch.arange(8), 3))["top-1"] <= 0.5
 
 
+@pytest.fixture(params=[512, 7])
+def in_blocks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows that are compared with all others at a time."""
+    monkeypatch.setattr(retrieval, "_ROWS", request.param)
+
+
+@pytest.mark.usefixtures("in_blocks")
 @pytest.mark.parametrize("threshold", [None, 0.9])
 def test_recall_equals_tmr(golden: dict[str, torch.Tensor], threshold: float | None) -> None:
     """TMR's threshold 0.95 is the cosine 2 * 0.95 - 1 = 0.9; it reports percent."""
@@ -66,21 +72,6 @@ def test_recall_equals_tmr(golden: dict[str, torch.Tensor], threshold: float | N
     assert mine == pytest.approx(expected, rel=1e-5)
 
 
-@pytest.mark.parametrize("distance", ["cosine", "euclidean"])
-@pytest.mark.parametrize("threshold", [None, 0.9])
-def test_blocks_of_rows_give_the_ranks_of_the_whole_matrix(
-    golden: dict[str, torch.Tensor],
-    monkeypatch: pytest.MonkeyPatch,
-    threshold: float | None,
-    distance: Distance,
-) -> None:
-    text, motion, sentence = golden["text"][:100], golden["gt"][:100], golden["tmr_sent_emb"][:100]
-    how = {"sentence": sentence if threshold else None, "threshold": threshold, "distance": distance}
-    whole = recall(text, motion, **how)
-    monkeypatch.setattr(retrieval, "_ROWS", 7)
-    assert recall(text, motion, **how) == whole
-
-
 def test_small_sets_are_easier_and_seeded(golden: dict[str, torch.Tensor]) -> None:
     text, motion = golden["text"], golden["gt"]
     full, c, d = (recall(text, motion, batch=n, seed=1) for n in (None, 256, 32))
@@ -91,6 +82,7 @@ def test_small_sets_are_easier_and_seeded(golden: dict[str, torch.Tensor]) -> No
     assert recall(text[:20], motion[:20], batch=256, seed=0) == recall(text[:20], motion[:20])
 
 
+@pytest.mark.usefixtures("in_blocks")
 def test_latents_as_they_are_are_compared_by_distance(golden: dict[str, torch.Tensor]) -> None:
     """Against sorting; by cosine the order is another one."""
     text, motion = golden["text"][:60], golden["pred"][:60]
