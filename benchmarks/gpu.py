@@ -12,10 +12,12 @@ named at the end. `--only "stages" "compiled gpt"` takes rows whose table and ti
   synchronised points, TFLOP/s and share of the data sheet's peak, peak of memory and what `--dry-run` says;
   "free": without `hardware.deterministic`, which is on by default;
 - `trainings`: stages as a run trains them (compiled), by their own telemetry, the first third left out;
+- `tokens`: 51 tokens drawn with the GPT of the size, neither text nor joints, the second of two calls;
 - `sampling`: whole-body motions of 196 frames, the second of two calls;
 - `bytes`: each training once more: are the weights the same;
 - `stages`: every stage of `baselines-tiny` and `baselines-tiny-ude`, 20 steps each;
-- `compiled`: the steps again, compiled as by default: replayed as CUDA graphs where networks are small.
+- `compiled`: the steps again, compiled and replayed as CUDA graphs as by default; the GPT also with
+  `train.residual: bf16`.
 """
 
 from __future__ import annotations
@@ -39,6 +41,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_map
 
 from motionloom.datasets.base.files import sha256_of
+from motionloom.models.gpt.sampling import generate as draw_tokens
 from motionloom.models.training.stage_module import Batch, StageModule
 from motionloom.pipeline.contract.lookup import previews
 from motionloom.pipeline.contract.sampling import SamplingConfig
@@ -54,7 +57,7 @@ from motionloom.pipeline.store.training_log import read_flight
 from motionloom.pipeline.store.yaml import dump_yaml
 from motionloom.pipeline.training.checkpointing import BackgroundWriter
 from motionloom.pipeline.training.config import TrainConfig
-from motionloom.pipeline.training.execution import LAUNCHES, deterministic, make_trainer
+from motionloom.pipeline.training.execution import LAUNCHES, deterministic, make_trainer, prepare_module
 from motionloom.pipeline.training.utilization import pass_flops, peak_flops
 
 PRECISIONS = {"fp32": "32-true", "bf16": "bf16-mixed"}
@@ -207,7 +210,9 @@ class Benchmark:
             update={"precision": PRECISIONS[precision], "compile": False, "accumulate": 1}
         )
         module = copy.deepcopy(made.module).train()
-        if how == "compiled":
+        if how == "residual":
+            prepare_module(module, train.model_copy(update={"residual": "bf16"}))
+        if how in ("compiled", "residual"):
             size = sum(param.numel() for param in module.parameters())
             module.compile_losses(graphs=self.device.type == "cuda" and size < LAUNCHES)
         if self.device.type == "cuda":
@@ -279,6 +284,21 @@ class Benchmark:
         after = sha256_of(self.until(name, first=name) / "model.safetensors")
         return {"sha256": f"{before[:12]} {after[:12]}", "equal": "yes" if before == after else "no"}
 
+    def tokens(self, make: Callable[[], Step], batch: int, half: bool) -> Cells:
+        """Sequences of 17 groups of a GPT whose weights are drawn, `batch` at once."""
+        net = make().module.net.to(self.device)
+        text = torch.randn(batch, net.text_dim, device=self.device)
+        groups = torch.full((batch,), 17)
+        for seed in range(2):  # the first one compiles and records
+            self.synchronize()
+            begin = time.perf_counter()
+            with torch.autocast(self.device.type, torch.bfloat16, enabled=half):
+                draw_tokens(net, text, groups=groups, seed=seed)
+            self.synchronize()
+            took = time.perf_counter() - begin
+        count = 17 * len(net.pattern)
+        return {"ms a token": f"{1000 * took / count:.2f}", "sequences/s": f"{batch / took:.0f}"}
+
     def sampling(self, batch: int, half: bool) -> Cells:
         """Motions for one caption, `batch` at once, in float32 or under bfloat16's autocast."""
         bundle = Bundle.open(self.until("gpt").parents[1], self.device)
@@ -287,9 +307,8 @@ class Benchmark:
             begin = time.perf_counter()
             how = {"seconds": seconds, "seed": seed}
             with torch.autocast(self.device.type, torch.bfloat16, enabled=half):
-                made = generate(
-                    bundle, Request.of(["a person walks forward"] * batch, sampling=SamplingConfig(), **how)
-                )
+                request = Request.of(["a person walks forward"] * batch, sampling=SamplingConfig(), **how)
+                made = generate(bundle, request, at_once=batch)
             self.synchronize()
             took = time.perf_counter() - begin
         return {
@@ -352,7 +371,12 @@ def measurements(bench: Benchmark) -> Iterator[tuple[str, str, Callable[[], Cell
         yield "steps", f"{name} bf16, free", partial(bench.step, make, "bf16", "free")
     for name in TRAINED:
         yield "trainings", name, partial(bench.training, name)
-    for batch in (1, 32, 256):
+    for batch in (1, 32, 256, 1024):
+        for half in (False, True):
+            title = f"{batch} at once, {'bf16' if half else 'fp32'}"
+            make = partial(kept, "humantomato", "gpt")
+            yield "tokens", title, partial(bench.tokens, make, batch, half)
+    for batch in (1, 32, 256, 1024):
         for half in (False, True):
             title = f"{batch} at once, {'bf16' if half else 'fp32'}"
             yield "sampling", title, partial(bench.sampling, batch, half)
@@ -364,6 +388,8 @@ def measurements(bench: Benchmark) -> Iterator[tuple[str, str, Callable[[], Cell
             yield "stages", f"{recipe} {name}", partial(run, name)
     for family, name in stepped:
         yield "compiled", f"{name} bf16", partial(bench.step, partial(kept, family, name), "bf16", "compiled")
+    make = partial(kept, "humantomato", "gpt")
+    yield "compiled", "gpt bf16, residual bf16", partial(bench.step, make, "bf16", "residual")
 
 
 def main() -> None:
@@ -372,7 +398,7 @@ def main() -> None:
     parser.add_argument("--size", choices=("paper", "small", "tiny"), default="paper")
     parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
     parser.add_argument("--minutes", type=float, default=10.0, help="after which no row is begun")
-    parser.add_argument("--steps", type=int, default=120, help="of each training; from 100 on with workers")
+    parser.add_argument("--steps", type=int, default=300, help="of each training; from 100 on with workers")
     parser.add_argument("--only", nargs="+", default=[], metavar="ROWS")
     args = arguments(parser)
     args.work.mkdir(parents=True, exist_ok=True)

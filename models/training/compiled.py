@@ -21,8 +21,8 @@ GRAPHS = 64
 """Graphs that one function may have: shapes of batches, training and validation, each kind of stage."""
 
 WORD_MULTIPLE = 16
-"""Captions of a batch are padded to a multiple of so many words: a CUDA graph has one shape, and each length
-would need its own."""
+"""Captions of a batch are padded to a multiple of so many words, and sequences to one of so many tokens: a
+CUDA graph has one shape, and each length would need its own."""
 
 
 class Compiled:
@@ -49,8 +49,9 @@ class Compiled:
         if self.graphs:
             torch.compiler.cudagraph_mark_step_begin()  # type: ignore[no-untyped-call]
         try:
-            filled = map(_pad_conditions, arguments) if self.graphs else arguments
-            return self.compiled(*filled)
+            if self.graphs:
+                return self.compiled(*(_pad_tokens(_pad_conditions(one), self.net) for one in arguments))
+            return self.compiled(*arguments)
         except (failures, exc.FailOnRecompileLimitHit) as error:
             if self.graphs:  # which may have drawn
                 torch.manual_seed(torch.initial_seed())
@@ -89,6 +90,22 @@ def _pad_conditions(argument: object) -> object:
         return argument
     filled = {name: _pad_words(condition) for name, condition in argument["conditions"].items()}
     return {**argument, "conditions": filled}
+
+
+def _pad_tokens(argument: object, net: nn.Module) -> object:
+    """Return a batch with sequences padded to a multiple of `WORD_MULTIPLE` tokens, or as many as the network
+    takes: a GPT of 150 has ten lengths.
+    """
+    most = getattr(getattr(net, "config", None), "block_size", 0)
+    if not most or not isinstance(argument, dict) or "tokens" not in argument:
+        return argument
+    size = argument["tokens"].shape[1]
+    more = max(0, min(size + -size % WORD_MULTIPLE, most) - size)
+    behind = {"tokens": -1, "kinds": 0, "known": True}
+    return {
+        name: pad(value, (0, more), value=behind[name]) if name in behind else value
+        for name, value in argument.items()
+    }
 
 
 def _pad_words(condition: Condition) -> Condition:

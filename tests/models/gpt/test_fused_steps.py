@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 import torch
@@ -37,13 +36,11 @@ def test_tokens_of_float32(plain: None, monkeypatch: pytest.MonkeyPatch, few: in
 
     monkeypatch.setattr(decoding, "FEW", few)
     monkeypatch.setattr(decoding.FixedSteps, "record", recording)
-    how: dict[str, Any] = {"cfg_scale": scale}
-    rows = [generate(gpt, text[row : row + 1], seed=[row], **how) for row in range(12)]
+    rows = [generate(gpt, text[row : row + 1], seed=[row], cfg_scale=scale) for row in range(12)]
     monkeypatch.setattr(sampling, "_FIXED", {"cpu"})
-    found = generate(gpt, text, seed=range(12), **how)
-    again = generate(gpt, text, seed=range(12), **how)
+    found = generate(gpt, text, seed=range(12), cfg_scale=scale)
     for row in range(12):
-        assert row_of(found, row) == row_of(again, row) == row_of(rows[row], 0)
+        assert row_of(found, row) == row_of(rows[row], 0)
     assert sizes[0] == 12 and sizes[-1] < 12, "rows have left"
 
 

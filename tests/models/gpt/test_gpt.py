@@ -13,6 +13,7 @@ from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.tokens import PAD
 from motionloom.models.tma.network import Tma, TmaConfig
+from motionloom.models.training import compiled
 from motionloom.models.training.stage_module import OptimConfig
 
 
@@ -194,6 +195,18 @@ def test_hand_over_is_checked() -> None:
     wide = {**batch, "text": torch.randn(4, 16), "tma_text": torch.randn(4, 12)}
     with pytest.raises(UserError, match="width 16"):
         module.losses(wide)
+
+
+def test_sequences_filled_up_for_cuda_graphs_have_the_same_losses() -> None:
+    """Of all lengths ten are left, each of which is one graph."""
+    module = aligned_gpt(block_size=150)[0].double().eval()
+    seq, text = sequences([8, 5], module.net)
+    batch = {"tokens": seq.tokens, "kinds": seq.kinds, "text": text.double(), "known": seq.tokens >= 0}
+    filled = compiled._pad_tokens(batch, module.net)
+    assert isinstance(filled, dict) and filled["tokens"].shape == filled["known"].shape == (2, 32)
+    torch.testing.assert_close(module.losses(filled), module.losses(batch))
+    sizes = [compiled._pad_tokens({"tokens": torch.zeros(1, n)}, module.net) for n in range(1, 151)]
+    assert len({one["tokens"].shape for one in sizes if isinstance(one, dict)}) == 10
 
 
 def test_every_clip_may_count_alike() -> None:
