@@ -23,7 +23,6 @@ named at the end. `--only "stages" "compiled gpt"` takes rows whose table and ti
 from __future__ import annotations
 
 import copy
-import json
 import statistics
 import tempfile
 import time
@@ -37,8 +36,10 @@ import lightning as L
 import torch
 from bench import Column, arguments, command_line, report
 from rich.console import Console
+from rows import Cells, Rows
 from torch import Tensor
 from torch.utils._pytree import tree_map
+from torch.utils.data import DataLoader
 
 from motionloom.datasets.base.files import sha256_of
 from motionloom.models.gpt.sampling import generate as draw_tokens
@@ -66,43 +67,6 @@ TRAINED = ("tokenizer", "tma", "gpt")
 FRAMES = 196
 SHORT = {"repeats": 2, "clips": 32, "size": 32, "decodings": 1, "truth_clips": 8, "movement_steps": 5}
 """Settings that make evaluations short."""
-FIRST = {"compiled": 60.0}
-"""Seconds that the first row of a table may take, where that is long."""
-Cells = dict[str, str]
-
-
-class Rows:
-    """Rows in a file, each written as it is measured, while there is time."""
-
-    def __init__(self, path: Path, minutes: float, only: list[str]) -> None:
-        self.path = path
-        self.end = time.monotonic() + 60 * minutes
-        self.only = tuple(only)
-        lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-        self.rows: list[dict[str, Any]] = [json.loads(line) for line in lines]
-        self.left_out: list[str] = []
-
-    def measure(self, table: str, title: str, cells: Callable[[], Cells]) -> None:
-        """Add a row unless it is there, not asked for, or not done in time; an error is a row too."""
-        if self.only and not f"{table} {title}".startswith(self.only):
-            return
-        of_table = [row for row in self.rows if row["table"] == table]
-        if any(row["title"] == title for row in of_table):
-            return
-        begin = time.monotonic()
-        if begin + (of_table[-1]["seconds"] if of_table else FIRST.get(table, 0.0)) > self.end:
-            self.left_out.append(f"{table}: {title}")
-            return
-        try:
-            found = cells()
-        except Exception as error:  # the next rows may work
-            found = {"error": f"{type(error).__name__}: {str(error)[:300]}"}
-        row = {"table": table, "title": title, "cells": found, "seconds": time.monotonic() - begin}
-        self.rows.append(row)
-        line = json.dumps(row)
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write(line + "\n")
-        print(line, flush=True)  # a pipe keeps back what is not flushed, and a kill loses that
 
 
 class Step(NamedTuple):
@@ -231,7 +195,7 @@ class Benchmark:
             folder,
         )
         with deterministic(hardware):
-            trainer.fit(module, [tree_map(self.moved, made.batch)] * 104)
+            trainer.fit(module, DataLoader([tree_map(self.moved, made.batch)] * 104, batch_size=None))
         cells = {"ms a step": f"{1000 * clock.mean:.1f}", "first, s": f"{clock.first:.1f}"}
         cells |= {"batch": str(train.batch_size), "TFLOP a step": f"{made.flops / 1e12:.3g}"}
         return cells | self.share(made.flops / clock.mean, train) | self.memory(made.estimated)
@@ -371,15 +335,11 @@ def measurements(bench: Benchmark) -> Iterator[tuple[str, str, Callable[[], Cell
         yield "steps", f"{name} bf16, free", partial(bench.step, make, "bf16", "free")
     for name in TRAINED:
         yield "trainings", name, partial(bench.training, name)
-    for batch in (1, 32, 256, 1024):
-        for half in (False, True):
-            title = f"{batch} at once, {'bf16' if half else 'fp32'}"
-            make = partial(kept, "humantomato", "gpt")
-            yield "tokens", title, partial(bench.tokens, make, batch, half)
-    for batch in (1, 32, 256, 1024):
-        for half in (False, True):
-            title = f"{batch} at once, {'bf16' if half else 'fp32'}"
-            yield "sampling", title, partial(bench.sampling, batch, half)
+    drawn = partial(bench.tokens, partial(kept, "humantomato", "gpt"))
+    for table, draw in {"tokens": drawn, "sampling": bench.sampling}.items():
+        for batch in (1, 32, 256, 1024):
+            for half in (False, True):
+                yield table, f"{batch} at once, {'bf16' if half else 'fp32'}", partial(draw, batch, half)
     for name in ("tokenizer", "gpt"):
         yield "bytes", name, partial(bench.again, name)
     for recipe in ("baselines-tiny", "baselines-tiny-ude"):
@@ -389,7 +349,7 @@ def measurements(bench: Benchmark) -> Iterator[tuple[str, str, Callable[[], Cell
     for family, name in stepped:
         yield "compiled", f"{name} bf16", partial(bench.step, partial(kept, family, name), "bf16", "compiled")
     make = partial(kept, "humantomato", "gpt")
-    yield "compiled", "gpt bf16, residual bf16", partial(bench.step, make, "bf16", "residual")
+    yield "compiled", "gpt, residual bf16", partial(bench.step, make, "bf16", "residual")
 
 
 def main() -> None:

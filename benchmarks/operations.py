@@ -31,7 +31,7 @@ from torch.utils._pytree import tree_leaves
 
 from motionloom.models.gpt import decoding
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
-from motionloom.models.gpt.sampling import Drawing, Rows
+from motionloom.models.gpt.rows import Drawing, Rows
 from motionloom.models.layers.attention import SelfAttention
 from motionloom.models.tokenizer.base import Stream
 from motionloom.pipeline.contract.lookup import previews

@@ -21,7 +21,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import torch
@@ -29,13 +29,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from motionloom.models.gpt.network import InterleavedGPT
+from motionloom.models.gpt.rows import Rows
 from motionloom.models.layers.attention import KVCache
 from motionloom.models.layers.graphs import recorded
 from motionloom.models.layers.linear import product_type
 from motionloom.models.layers.transformer import Block
-
-if TYPE_CHECKING:
-    from motionloom.models.gpt.sampling import Rows
 
 ROOM = 32
 """Places of a cache of fixed size are a multiple of this, so that few lengths have a graph of their own."""

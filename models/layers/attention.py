@@ -196,7 +196,7 @@ class SelfAttention(nn.Module):
         query, key, value = (self._heads(part) for part in projected.chunk(3, dim=-1))
         if cache is not None:
             before = cache.length
-            pairs = projected[..., dim:].unflatten(-1, (2, self.heads, -1))
+            pairs = projected[..., dim:].view(batch, length, 2, self.heads, -1)
             key, value = cache.append(pairs.permute(2, 0, 3, 1, 4))
             if causal and before and length > 1:
                 seen = torch.ones(length, before + length, dtype=torch.bool, device=projected.device)

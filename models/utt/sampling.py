@@ -22,7 +22,8 @@ from torch.nn.functional import pad
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.models.condition.mate import Encoded
-from motionloom.models.gpt.sampling import Drawing, Rows, requested_groups, seeds_of, uniform_numbers
+from motionloom.models.gpt.rows import Drawing, Rows
+from motionloom.models.gpt.sampling import requested_groups, seeds_of, uniform_numbers
 from motionloom.models.gpt.tokens import Codes, as_codes, slot_codes
 from motionloom.models.layers.frozen import evaluating
 from motionloom.models.utt.backbone import State

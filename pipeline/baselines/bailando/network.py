@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from motionloom.datasets.base.config import Config
-from motionloom.models.gpt.sampling import Drawing
+from motionloom.models.gpt.rows import Drawing
 from motionloom.models.layers.transformer import StackConfig, Transformer
 
 

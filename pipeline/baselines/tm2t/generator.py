@@ -16,7 +16,7 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.json_doors import require_plain
 from motionloom.datasets.base.records import PRESENT_ALL
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.models.gpt.sampling import Drawing
+from motionloom.models.gpt.rows import Drawing
 from motionloom.models.gpt.tokens import interleave
 from motionloom.pipeline.baselines.tm2t.network import END, START, Captioner, Reading, Vocabulary
 from motionloom.pipeline.baselines.tm2t.seq2seq import Seq2Seq, draw_tokens

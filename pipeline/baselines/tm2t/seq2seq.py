@@ -18,7 +18,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from motionloom.datasets.base.config import Config
-from motionloom.models.gpt.sampling import Drawing, Rows, requested_groups, uniform_numbers
+from motionloom.models.gpt.rows import Drawing, Rows
+from motionloom.models.gpt.sampling import requested_groups, uniform_numbers
 from motionloom.models.gpt.tokens import Codes, TokenNetwork, as_codes
 from motionloom.models.layers.frozen import evaluating
 from motionloom.models.layers.transformer import LayerNorm

@@ -84,7 +84,8 @@ class GptGenerator(OfTokens):
         self, prior: Tensor, frames: Sequence[int] | None, seeds: Sequence[int], sampling: SamplingConfig
     ) -> list[NDArray[np.float32]]:
         """One motion for each row of the prior [B, E]."""
-        from motionloom.models.gpt.sampling import Drawing, generate
+        from motionloom.models.gpt.rows import Drawing
+        from motionloom.models.gpt.sampling import generate
 
         codes = generate(
             self.gpt.net,

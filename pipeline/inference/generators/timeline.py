@@ -19,7 +19,7 @@ from torch import Tensor
 
 from motionloom.datasets.conditions import Condition, Conditions
 from motionloom.datasets.modalities.table import MODALITIES
-from motionloom.models.gpt.sampling import Drawing
+from motionloom.models.gpt.rows import Drawing
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.tokenizer.base import GROUP_FRAMES
 from motionloom.models.utt.network import ConditionedUtt

@@ -11,7 +11,8 @@ from second_device import SECOND, WAITS, Far, second_device
 from toy_gpt import row_of, toy_gpt
 
 from motionloom.models.gpt import decoding, sampling
-from motionloom.models.gpt.sampling import Drawing, generate
+from motionloom.models.gpt.rows import Drawing
+from motionloom.models.gpt.sampling import generate
 
 VIEWS = {
     "alias",

@@ -8,7 +8,8 @@ from toy_gpt import STREAMS, row_of, toy_gpt
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.models.gpt.network import InterleavedGPT
-from motionloom.models.gpt.sampling import Drawing, filter_logits, generate, sample_seeds
+from motionloom.models.gpt.rows import Drawing, filter_logits
+from motionloom.models.gpt.sampling import generate, sample_seeds
 
 
 @pytest.fixture

@@ -11,7 +11,8 @@ from toy_gpt import PATTERN, STREAMS, encoded, random_codes, row_of
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.models.condition.mate import Encoded
-from motionloom.models.gpt.sampling import Drawing, sample_seeds
+from motionloom.models.gpt.rows import Drawing
+from motionloom.models.gpt.sampling import sample_seeds
 from motionloom.models.gpt.tokens import Codes, interleave
 from motionloom.models.utt.network import Utt, UttConfig
 from motionloom.models.utt.sampling import draw_z, generate, join, last_groups, window_start

@@ -18,7 +18,7 @@ from motionloom.datasets.modalities.modality import FrameStats
 from motionloom.datasets.synth.dances import DanceConfig
 from motionloom.datasets.synth.music.recording import render_song
 from motionloom.models.condition.mate import MateConfig
-from motionloom.models.gpt.sampling import Drawing
+from motionloom.models.gpt.rows import Drawing
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.tokenizer.base import Stream
 from motionloom.models.utt.network import ConditionedUtt, UttConfig

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from toy_gpt import PATTERN, STREAMS, closed
 
-from motionloom.models.gpt.sampling import Drawing
+from motionloom.models.gpt.rows import Drawing
 from motionloom.models.gpt.tokens import interleave
 from motionloom.models.training.stage_module import OptimConfig
 from motionloom.pipeline.baselines.tm2t.generator import likeliest
