@@ -13,7 +13,6 @@ import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
@@ -176,15 +175,21 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(cast(Any, file), "sha256").hexdigest()
 
 
-def content_of(path: Path) -> str:
-    """The same of a source file; it is read again only where its size or its time has changed."""
-    about = path.stat()
-    return _content_of(path, about.st_size, about.st_mtime_ns)
+State = list[int]
+"""Size, times and inode of a file (`state_of`)."""
 
 
-@lru_cache(maxsize=2**20)
-def _content_of(path: Path, size: int, changed: int) -> str:
-    return sha256_of(path)
+def state_of(path: Path) -> State:
+    """Return size, times and inode, which change when somebody writes or replaces a file; empty without one.
+
+    The time of the last change of any kind (ctime) is the system's own: a copy that restores the time of the
+    last write, as rsync does, is seen, and so are files of two machines that lie under one path.
+    """
+    try:
+        status = path.stat()
+    except OSError:
+        return []
+    return [status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino]
 
 
 def sha256_of_json(value: object) -> str:

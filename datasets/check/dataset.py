@@ -30,7 +30,7 @@ from rich.progress import track
 
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.base.files import write_json
+from motionloom.datasets.base.files import State, state_of, write_json
 from motionloom.datasets.base.pool import Workers
 from motionloom.datasets.base.records import (
     INDEX_FILE,
@@ -47,7 +47,6 @@ from motionloom.datasets.check.shard import ShardReport, SoundClip, examine_shar
 from motionloom.datasets.convert.common.removed import Removed
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.plausibility import FigureMeasure, PlausibilityStats
-from motionloom.datasets.shards.checksums import State, state_of
 from motionloom.datasets.shards.index import SplitIndex, load_index
 from motionloom.datasets.shards.reader import manifest_layout, read_manifest
 from motionloom.datasets.shards.store import LocalStore

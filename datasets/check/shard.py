@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.files import State, state_of
 from motionloom.datasets.base.json_doors import open_plain
 from motionloom.datasets.base.records import ClipMeta, ShardInfo
 from motionloom.datasets.check.clip import CheckedClip, check_clip
@@ -17,7 +18,7 @@ from motionloom.datasets.check.duplicates import signature
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.plausibility import FigureMeasure, measure
-from motionloom.datasets.shards.checksums import LocalShard, State, require_intact, state_of
+from motionloom.datasets.shards.checksums import LocalShard, require_intact
 from motionloom.datasets.shards.index import ShardIndex, SplitIndex, Written, entries_of, index_path
 from motionloom.datasets.shards.tar import TarClip, scan_tar
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from motionloom.datasets.base.config import require_local
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.memory import remembering
 from motionloom.datasets.base.records import REMOVED_FILE
 from motionloom.datasets.base.register import declare, discover
 from motionloom.datasets.convert.common.config import ConvertConfig
@@ -21,6 +23,10 @@ declare(
         for name in ("aistpp", "amass", "bvh", "humanml3d", "motionx")
     },
 )
+
+
+SOURCES_FILE = ".sources.json"
+"""Beside the shards: what was read of the source's files."""
 
 
 def names() -> list[str]:
@@ -48,12 +54,20 @@ def prepare(
     out: Path | None = None,
     workers: int = 1,
     progress: bool = False,
+    write: bool = False,
 ) -> Conversion[Any]:
     """Look at the whole source and decide what becomes of every file; nothing is converted yet.
 
     `kind` is the converter, by default the one whose config it is. Joint maps that are guessed are written
-    into `out`, the folder of the shards.
+    into `out`, the folder of the shards. With `write`, for a plan that is carried out, what files say and
+    their checksums are noted there: parts, and later conversions, read what has changed.
     """
+    if write and out is not None and config.source.exists():
+        require_local(out)
+        with remembering(out / SOURCES_FILE):
+            conversion = prepare(config, kind=kind, out=out, workers=workers, progress=progress)
+            assert conversion.options
+            return conversion
     kind = kind or next((one for one in converters() if one.config_class is type(config)), None)
     if kind is None:
         raise UserError(f"no converter takes a {type(config).__name__}; register its converter, or name it")

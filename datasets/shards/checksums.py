@@ -12,12 +12,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.base.files import sha256_of
+from motionloom.datasets.base.files import State, sha256_of, state_of
 from motionloom.datasets.base.json_doors import require_plain
 from motionloom.datasets.base.records import ShardInfo
 
-State = list[int]
-"""Size, times and inode of a file (`state_of`)."""
 _ADVICE = "copy it back or convert again"
 
 
@@ -29,19 +27,6 @@ class LocalShard(NamedTuple):
 
     def state(self) -> State:
         return state_of(self.path)
-
-
-def state_of(path: Path) -> State:
-    """Return size, times and inode, which change when somebody writes or replaces a file; empty without one.
-
-    The time of the last change of any kind (ctime) is the system's own: a copy that restores the time of the
-    last write, as rsync does, is seen, and so are files of two machines that lie under one path.
-    """
-    try:
-        status = path.stat()
-    except OSError:
-        return []
-    return [status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino]
 
 
 def require_intact(shard: LocalShard, *, content: bool = True) -> None:

@@ -215,7 +215,7 @@ def convert_command(
         say(console, f"convert it: {line}" if line else "nothing of it can be converted")
         return
     require_folder(out)
-    conversion = prepare(config, kind=converter, out=out, workers=workers, progress=shown)
+    conversion = prepare(config, kind=converter, out=out, workers=workers, progress=shown, write=True)
     for line in conversion.plan.sums:
         say(console, line)
     for note in conversion.plan.notes:

@@ -18,11 +18,10 @@ from pydantic import Field, JsonValue, field_validator
 
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.base.files import sha256_of
+from motionloom.datasets.base.files import State, sha256_of, state_of
 from motionloom.datasets.base.json_doors import parse_json, read_plain
 from motionloom.datasets.base.licences import UNKNOWN, strictest
 from motionloom.datasets.base.lock import LOCK_FILE, file_lock
-from motionloom.datasets.shards.checksums import State, state_of
 from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.run_folder import STAGE_NAME, identity_of, in_export, owner_of, stage_folder
 

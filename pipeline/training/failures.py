@@ -21,8 +21,8 @@ import torch.distributed as dist
 from rich.console import Console
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.files import state_of
 from motionloom.datasets.base.os_errors import full_place
-from motionloom.datasets.shards.checksums import state_of
 from motionloom.models.training.any_trainer import OtherNetworkError
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.finite import first_failure

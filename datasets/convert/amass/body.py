@@ -19,7 +19,7 @@ from pydantic import Field
 from motionloom.datasets.audio.features import VERSION, AudioSettings, audio_features, rows_at
 from motionloom.datasets.audio.sound import read_sound, resample_sound, sound_seconds
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.base.files import content_of
+from motionloom.datasets.base.memory import content_of
 from motionloom.datasets.base.records import Split
 from motionloom.datasets.convert.amass.convert import FINGERS_MOVE
 from motionloom.datasets.convert.amass.smpl_npz import read_motion, read_motion_header

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -10,7 +11,8 @@ from functools import partial
 from pathlib import Path
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.base.json_doors import read_plain
+from motionloom.datasets.base.json_doors import parse_json, read_plain
+from motionloom.datasets.base.memory import recall
 from motionloom.datasets.convert.common.files import read_in_threads, walk_files
 from motionloom.datasets.motion.bvh.asf import FPS, JOINED, frame_marks, read_amc, skeleton_of
 from motionloom.datasets.motion.bvh.joint_map import skeleton_key
@@ -79,7 +81,7 @@ class FoundFile:
     path: str
     """Inside the source; names it in reports."""
     sha256: str = ""
-    """Empty when it cannot be opened."""
+    """Empty when it cannot be read."""
     frames: int = 0
     fps: float = 0.0
     skeleton: str = ""
@@ -98,13 +100,19 @@ def scan_files(root: Path, names: Sequence[str], *, workers: int, progress: bool
 
 
 def _scan(root: Path, name: str) -> FoundFile:
-    digest = ""
+    path = root / name
+
+    def read() -> str:
+        data = read_file(path, name)
+        return json.dumps([hashlib.sha256(data).hexdigest(), *_read_header(data, name)])
+
     try:
-        data = read_file(root / name, name)
-        digest = hashlib.sha256(data).hexdigest()
-        return FoundFile(name, digest, *_read_header(data, name))
+        # Others are read with further files.
+        noted = recall("bvh", path, read) if path.suffix.lower() == ".bvh" else read()
+        digest, frames, fps, skeleton, joints, miscounted = parse_json(noted, name)
+        return FoundFile(name, digest, frames, fps, skeleton, tuple(joints), miscounted)
     except Exception as error:  # whatever bad bytes or names make of the libraries below
-        return FoundFile(name, digest, problem=drop(name, error).reason)
+        return FoundFile(name, problem=drop(name, error).reason)
 
 
 def read_motion(data: bytes, label: str) -> BvhMotion:

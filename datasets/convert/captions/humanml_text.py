@@ -12,6 +12,7 @@ Choices:
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
 
 from motionloom.datasets.base.errors import UserError
@@ -71,7 +72,7 @@ def parse_caption(line: str, *, seconds: float | None, source: str = "humanml3d"
 
 def _caption_and_tokens(fields: list[str]) -> tuple[str, list[str] | None]:
     for last in range(len(fields) - 1, 0, -1):
-        tokens = "#".join(fields[last:]).split()
+        tokens = [*map(sys.intern, "#".join(fields[last:]).split())]  # the same few thousand in all clips
         if all(_TOKEN.fullmatch(token) for token in tokens):
             return "#".join(fields[:last]), tokens or None
     tokens = [token for token in fields[-1].split() if _TOKEN.fullmatch(token)]

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.memory import recall
 from motionloom.datasets.motion.npz import MAX_BYTES, ArrayHeader, npy_header
 
 Limit = float | NDArray[np.float64]
@@ -39,9 +40,13 @@ def load_array(
 def check_array_header(path: Path, *, width: int | tuple[int, ...], name: str | None = None) -> int:
     """T of a file that `load_array` accepts as far as header and size tell; `UserError` otherwise."""
     label = str(path) if name is None else name
-    header = npy_header(path, label, MAX_BYTES)
-    _check_header(header, width, label)
-    return header.shape[0]
+
+    def read() -> int:
+        header = npy_header(path, label, MAX_BYTES)
+        _check_header(header, width, label)
+        return header.shape[0]
+
+    return recall(f"frames of {width}", path, read)
 
 
 def _check_header(header: ArrayHeader, width: int | tuple[int, ...], label: str) -> None:

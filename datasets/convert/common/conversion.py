@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import operator
 from collections import Counter
 from collections.abc import Callable
@@ -11,7 +13,6 @@ from pathlib import Path
 from typing import Any, Generic
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.base.records import SPLITS, Manifest, Split
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
@@ -21,7 +22,7 @@ from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.planned import C
 from motionloom.datasets.shards.index import load_index
 from motionloom.datasets.shards.left_out import grouped_notes
-from motionloom.datasets.shards.options import DatasetFacts, Part, WriteOptions
+from motionloom.datasets.shards.options import SOURCE_CHECKSUM, DatasetFacts, Part, WriteOptions
 from motionloom.datasets.shards.reader import load_manifest
 from motionloom.datasets.shards.tasks import plan_shards
 from motionloom.datasets.shards.writer import dataset_writer
@@ -50,8 +51,13 @@ class Conversion(Generic[C]):
         clips = [clip for _, clip in self.plan.items]
         read = self.converter.depends_on
         settings = self.settings
-        content = [*read_in_threads(read, clips, workers=settings.workers, progress=settings.progress)]
-        return self.converter.options() | {"source_sha256": sha256_of_json(content)}
+        content = read_in_threads(read, clips, workers=settings.workers, progress=settings.progress)
+        # That of the list of all, of which a million clips have a gigabyte.
+        whole = hashlib.sha256(b"[")
+        for number, one in enumerate(content):
+            whole.update(f"{', ' if number else ''}{json.dumps(one, sort_keys=True)}".encode())
+        whole.update(b"]")
+        return self.converter.options() | {SOURCE_CHECKSUM: whole.hexdigest()}
 
     def facts(self) -> DatasetFacts:
         # Of a few chosen clips (`limit`) those count that were tried.

@@ -13,6 +13,7 @@ from typing import TypeVar
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.json_doors import read_plain
+from motionloom.datasets.base.memory import recall
 from motionloom.datasets.base.progress import Meter
 
 T = TypeVar("T")
@@ -21,6 +22,8 @@ R = TypeVar("R")
 MAX_TEXT_BYTES = 64 << 20
 """A text file beyond this is refused unread; the longest split list of a release has a few MB."""
 
+_MOST_NOTED = 4096
+"""Bytes of the captions of one clip; longer texts are lists, which are read each time."""
 _LONGEST = 240
 """Bytes of a part of a name, with room for a suffix: file systems have 255."""
 
@@ -33,7 +36,11 @@ def read_text_file(path: Path, name: str | None = None) -> str:
     `name` stands for the path in errors that go into a manifest. `UserError` when the file cannot be read, is
     far too long, no text at all, or is not UTF-8; the last names line and byte, counted from 0.
     """
-    name = str(path) if name is None else name
+    label = str(path) if name is None else name
+    return recall("text", path, lambda: _read_text(path, label), most=_MOST_NOTED)
+
+
+def _read_text(path: Path, name: str) -> str:
     try:
         raw = read_plain(path, MAX_TEXT_BYTES)
     except OSError as error:
@@ -187,6 +194,8 @@ def read_in_threads(
     """
     meter = Meter("reading the source", len(items), shown=progress)
     with meter, ThreadPoolExecutor(max(workers, 1)) as pool:
-        for made in pool.map(read, items):
-            yield made
-            meter.advance()
+        # By thousands: a task that waits takes a kilobyte.
+        for first in range(0, len(items), 4096):
+            for made in pool.map(read, items[first : first + 4096]):
+                yield made
+                meter.advance()

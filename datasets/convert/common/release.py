@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.base.files import content_of
+from motionloom.datasets.base.memory import content_of
 from motionloom.datasets.base.records import Caption, ClipMeta, Split
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings

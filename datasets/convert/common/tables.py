@@ -128,7 +128,7 @@ def captions_within(
     for text in texts:
         if text.start < seconds and (text.end is None or text.end <= seconds + END_TOLERANCE):
             end = None if text.end is None else min(text.end, seconds)
-            kept.append(text.model_copy(update={"end": end}))
+            kept.append(text if end == text.end else text.model_copy(update={"end": end}))
         else:
             what = f"starts at {text.start:g} s" if text.start >= seconds else f"ends at {text.end:g} s"
             notes.append(f"{clip}: a caption {what}, beyond its {seconds:.1f} s")

@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.base.files import content_of, is_file
+from motionloom.datasets.base.files import is_file
+from motionloom.datasets.base.memory import content_of
 from motionloom.datasets.base.records import Caption
 from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.base.files import content_of
+from motionloom.datasets.base.memory import content_of
 from motionloom.datasets.base.records import Caption, Split
 from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions

@@ -49,7 +49,9 @@ class ConvertStage(DataStage):
         workers = context.hardware.convert_workers
         part = context.hardware.part
         shown = not context.console.quiet
-        conversion = prepare(context.config, kind=self.converter, out=out, workers=workers, progress=shown)
+        conversion = prepare(
+            context.config, kind=self.converter, out=out, workers=workers, progress=shown, write=True
+        )
         manifest = run_conversion(
             conversion,
             out,

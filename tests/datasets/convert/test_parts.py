@@ -91,6 +91,35 @@ def test_parts_that_run_at_once_and_die_give_the_bytes_of_one_process(source: Pa
     assert digests(tmp_path / "parts") == digests(tmp_path / "whole"), f"{count} parts"
 
 
+def test_one_part_reads_the_source_for_all(shared: Path, tmp_path: Path) -> None:
+    """The others open their own clips; later conversions what has changed."""
+    opened: list[Path] = []
+    sys.addaudithook(
+        lambda event, of: opened.append(Path(of[0])) if event == "open" and str(of[0])[:1] == "/" else None
+    )
+    source = Path(shutil.copytree(shared / "data/layouts/humanml3d", tmp_path / "source"))
+    kind = converter_named("humanml3d")
+    config = kind.config_class.parse({"source": source, "look": 0}, "test")
+
+    def read() -> set[str]:
+        return {path.stem for path in opened if path.parent.parent == source}
+
+    for out, part in (*(("parts", Part(number, 2)) for number in (1, 2)), ("whole", None)):
+        opened.clear()
+        planned = prepare(config, kind=kind, out=tmp_path / out, write=True)
+        manifest = run_conversion(planned, tmp_path / out, progress=False, clips_per_shard=2, part=part)
+        indices = [tmp_path / out / shard.name.replace(".tar", ".index.json") for shard in manifest.shards]
+        own = {
+            Path(clip["source"]).stem for path in indices for clip in json.loads(path.read_text())["clips"]
+        }
+        assert own and (read() == own or part in (None, Part(1, 2))), f"{out} {part}"
+    join_parts(tmp_path / "parts")
+    assert digests(tmp_path / "parts") == digests(tmp_path / "whole")
+    opened.clear()
+    (source / "texts/900002.txt").touch()
+    assert prepare(config, kind=kind, out=tmp_path / "whole", write=True).options and read() == {"900002"}
+
+
 SILENT = {"audio_features": False, "sound_rate": 8000}
 CASES: dict[str, dict[str, Any]] = {
     "bvh": {"licence": "CC0-1.0"}, "humanml3d": {}, "motionx": {}, "aistpp": {"sound": "none"}, "amass": {},
