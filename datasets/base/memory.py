@@ -44,7 +44,7 @@ def remembering(note: Path) -> Iterator[None]:
             stack.enter_context(file_lock(lock))
             stack.callback(lock.unlink, missing_ok=True)
         noted: dict[str, Any] = {}
-        with suppress(UserError, OSError, ValueError):  # none, or damaged
+        with suppress(UserError, OSError, ValueError, TypeError):  # none, or damaged
             noted = dict(parse_json(read_plain(note, _MOST_BYTES), str(note)))
             _known.update((key, value) for key, value in noted.items() if isinstance(value, str | int))
         _asked.append(asked)
