@@ -58,6 +58,7 @@ def advance_fused(gpt: InterleavedGPT, rows: Rows, cache: KVCache) -> None:
     more = gpt.positions[cache.at].expand(x.shape).contiguous()
     mask = cache.mask(rows.weight)
     for block, layer in zip(gpt.stack.blocks, cache.layers, strict=True):
+        assert isinstance(block, Block)
         projected = _compiled(_project)(block, x, more)
         attended = block.attention.mix(projected, mask, cache=layer)
         x, more = _compiled(_feed)(block, x, more, attended)
