@@ -41,7 +41,19 @@ DOCUMENTS += sorted((ROOT / "docs").glob("*.md"))
 DOCUMENTS += sorted((ROOT / "models" / "pretrained").glob("*/README.md"))
 DOCUMENTS += sorted((ROOT / "pipeline" / "baselines").glob("*/README.md"))
 DOCUMENTS.append(ROOT / "pipeline" / "songs" / "README.md")
-OTHER_PROGRAMS = {".", "curl", "diff", "energon", "export", "hf", "module", "pip", "python", "pre-commit", "uv"}
+OTHER_PROGRAMS = {
+    ".",
+    "curl",
+    "diff",
+    "energon",
+    "export",
+    "hf",
+    "module",
+    "pip",
+    "python",
+    "pre-commit",
+    "uv",
+}
 LAUNCHERS = {"srun", "torchrun"}
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.actions.dances import Record, measure_dance
 from motionloom.datasets.actions.hands import SIDES, hand_shape
-from motionloom.datasets.actions.signals import Signals, rise_time, signals_of, tempo
+from motionloom.datasets.actions.signals import BALLS, Signals, rise_time, signals_of, tempo
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.expressions import emotion_of
 from motionloom.datasets.motion.canonical import runs
@@ -27,12 +27,19 @@ from motionloom.datasets.motion.canonical import runs
 CIRCLE = 4.0
 """Net turn (radians) of a walk or a run from which it is a circle."""
 TURN = 0.6
+WALKED = 0.3
+"""Metres from which somebody has gone somewhere."""
 LYING = 0.62
 """Metres that the root falls of somebody who lies down, at least."""
 ASIDE = 0.22
 """Lean (radians) to a side from which somebody stretches there."""
 UPRIGHT = 0.055
 """Change of lean to the side (radians) below which somebody stands upright all the time; twice forward."""
+_LENGTH = 1.0
+"""Seconds that a motion may be shorter or longer than was said."""
+_SHAPES = {
+    "fist": "a fist", "point": "pointing", "spread": "open", "pinch": "pinching", "wave_fingers": "wiggling",
+}  # fmt: skip
 _NOUNS = {"lie": "lying down", "sit": "sitting"}
 _ATTRIBUTES = ("direction", "side", "count", "speed", "bpm")
 
@@ -93,19 +100,32 @@ def find_mismatch(requests: Sequence[Record], joints: NDArray[np.floating], fps:
     Of several requests, which a caption may mean, one has to be shown.
     """
     shown = []
+    signals = signals_of(joints, fps)
     for request in requests:  # by their actions alone, whatever the attributes are
         bare = {"action": request["action"], "parts": [{"action": act} for act in actions_of(request)]}
-        if agrees(bare, joints, None, fps)["action"]:
+        walks = request["action"] == "walk" and _moved(signals) > WALKED and _action(signals) == "turn"
+        if walks or agrees(bare, joints, None, fps)["action"]:  # who turns on the way walks
             shown.append(request)
     if not shown:
         wanted = (" and then ".join(_NOUNS.get(act, act) for act in actions_of(one)) for one in requests)
         return f"the motion shows no {' nor '.join(wanted)}"
-    if len(actions_of(shown[0])) > 1:
-        return None  # which part of two shows a side or a count is not known
-    seen = _attributes(signals_of(joints, fps), shown[0]["action"])
-    for name, wanted in shown[0].items():
-        if name != "action" and seen.get(name) != wanted:
-            return f"the {name} is {seen.get(name) or 'another'}, not {wanted}"
+    asked = shown[0]
+    if abs(len(joints) / fps - asked.get("seconds", len(joints) / fps)) > _LENGTH:
+        return f"it lasts {len(joints) / fps:.1f} s, not {asked['seconds']}"
+    for side, name in enumerate(SIDES):
+        wanted = asked.get(f"{name}_hand")
+        shape = hand_shape(joints, side, fps) if wanted and joints.shape[1] >= 52 else wanted
+        if shape != wanted:
+            return f"the {name} hand is {_SHAPES.get(shape, shape)}, not {_SHAPES[wanted]}"
+    if len(actions_of(asked)) > 1:
+        # Where the first ends is not known: something is wrong that is so wherever the motion is cut.
+        held = agrees(asked, joints, None, fps)
+        wrong = [name for name, holds in held.items() if not holds]
+        return f"the {wrong[0]} of one of both is another" if wrong else None
+    seen = _attributes(signals, asked["action"])
+    for name in seen:  # of what this action does not define, nothing is known
+        if asked.get(name) is not None and seen[name] != asked[name]:
+            return f"the {name} is {seen[name] or 'another'}, not {asked[name]}"
     return None
 
 
@@ -133,7 +153,7 @@ def _cuts(frames: int, fps: float) -> range:
 
 
 def _action(s: Signals) -> str:
-    moved = abs(float(s.travel[-1]))
+    moved = _moved(s)
     turned = abs(_turned(s))
     # From signs that no other action shows to those that several share, so that each test may assume that
     # the ones before it failed. First who is on the floor.
@@ -150,7 +170,7 @@ def _action(s: Signals) -> str:
     if flights and s.drop.min() < -0.05:
         return "jump"
     # A kick lifts a foot as high as no walker does.
-    if moved > 0.3 and s.balls.max() < 0.4:
+    if moved > WALKED and s.balls.max() < 0.4:
         return "turn" if TURN < turned < CIRCLE else "walk"
     if turned > TURN:
         return "turn"
@@ -203,9 +223,12 @@ def _attributes(s: Signals, action: str) -> Record:
         backward = s.travel[-1] < 0
         turned = _turned(s)
         way = "backward" if backward else "forward"
+        aside = _aside(s)
+        if abs(aside) > abs(s.travel[-1]):
+            way = "sideways"
         if abs(turned) > CIRCLE:
             way = "counterclockwise" if turned > 0 else "clockwise"
-        found = {"direction": way, "path": _path(s)}
+        found = {"direction": way, "path": _path(s), "side": SIDES[0] if aside > 0 else SIDES[1]}
         if action == "walk":
             found["speed"] = _speed(_pace(s), *((0.57, 0.98) if backward else (0.78, 1.38)))
         return found
@@ -220,7 +243,7 @@ def _attributes(s: Signals, action: str) -> Record:
         return {"speed": _speed(1 / rise_time(s.trunk, s.fps), 1 / 1.14, 1 / 0.68)}
     if action == "kick":
         leg = int(np.argmax(s.balls.max(1)))
-        return {"side": SIDES[leg], "count": s.peaks(s.balls[leg], 0.4)}
+        return {"side": SIDES[leg], "count": s.peaks(s.balls[leg], 0.4), "direction": _kicked(s, leg)}
     if action == "punch":
         hand = int(np.argmax(s.wrists[:, :, 2].max(1)))
         return {"side": SIDES[hand], "count": s.peaks(s.wrists[hand, :, 2], 0.15, 0.7)}
@@ -243,6 +266,31 @@ def _attributes(s: Signals, action: str) -> Record:
         hand, direction = _reach(s)
         return {"side": SIDES[hand], "direction": direction}
     return {"bpm": tempo(s)} if action == "dance" else {}
+
+
+def _moved(s: Signals) -> float:
+    return max(abs(float(s.travel[-1])), abs(_aside(s)))
+
+
+def _aside(s: Signals) -> float:
+    """Metres that the feet have gone to the left of the heading."""
+    step = np.diff(s.joints[:, BALLS].mean(1)[:, [0, 2]], axis=0)
+    return float((step * _left(s)[1:]).sum())
+
+
+def _left(s: Signals) -> NDArray[np.float64]:
+    return np.stack([np.cos(s.heading), -np.sin(s.heading)], axis=-1)
+
+
+def _kicked(s: Signals, leg: int) -> str:
+    """Where a foot goes, from its hip, at the height of the kick."""
+    top = int(np.argmax(s.balls[leg]))
+    away = (s.joints[top, BALLS[leg]] - s.joints[top, 1 + leg])[[0, 2]]
+    left = _left(s)[top]
+    forward = float(away @ (-left[1], left[0]))
+    if abs(float(away @ left)) > abs(forward):
+        return "sideways"
+    return "forward" if forward > 0 else "backward"
 
 
 def _reach(s: Signals) -> tuple[int, str]:

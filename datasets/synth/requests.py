@@ -19,7 +19,7 @@ _PATTERNS: dict[str, str] = _TABLE["actions"]
 """Words for each action."""
 _DIRECTIONS: dict[str, dict[str, str]] = _TABLE["directions"]
 _SPEEDS: dict[str, str] = _TABLE["speeds"]
-_TWO_WORDS = (("turn", "walk"), ("hop", "jump"), ("reach", "bow"), ("stretch", "raise"))
+_TWO_WORDS = (("turn", "walk"), ("hop", "jump"), ("reach", "bow"), ("reach", "stretch"), ("stretch", "raise"))
 """Pairs of which a caption with both asks for the first alone: who turns may walk."""
 _RAISED = {"reach": "up", "stretch": "arms?"}
 """Words beside which a raised arm may be meant."""
@@ -31,15 +31,21 @@ _NEGATIONS = (
     r"|dont|doesnt|didnt|isnt|arent|wasnt|wont|cant|(stop|refuse|avoid)(s|d|ed)?|stopped"
 )
 _HAND = r"(?:the |his |her |their )?(left|right|both) hands?"
-_FINGERS = (
-    rf"fists? (?:with|of) {_HAND}|{_HAND} in(?:to)? (?:a )?fists?",
-    rf"pointing (?:the index finger of|with) {_HAND}"
+_FINGERS = {
+    "fist": rf"(?:a |both )?fists? (?:with|of) {_HAND}|{_HAND} in(?:to)? (?:a )?fists?"
+    rf"|{_HAND} (?:clenched|closed)|(?:\w+ )?fists? (?:is |are )?clenched"
+    r"|(?:clench|ball|mak|clos)\w* (?:\w+ ){0,3}(?:fists?|hands?)\b",
+    "point": rf"pointing (?:the index finger of|with) {_HAND}"
     r"|pointing with (?:the |his |her )?(left|right) index finger",
-    rf"spread\w* the fingers of {_HAND}|the fingers of {_HAND} spread",
-    rf"pinch\w*(?: thumb and index finger)? (?:with|of) {_HAND}",
-    rf"(?:wiggling|waving) the fingers of {_HAND}",
-)
-"""Phrases about fingers, whose side is not the action's."""
+    "spread": rf"spread\w* the fingers of {_HAND}|the fingers of {_HAND} spread|{_HAND} (?:wide )?open\b"
+    r"|(?:spread|open)(?:ing|s)? (?:wide )?(?:the |his |her |their )?(?:(?:left|right|both) )?"
+    r"(?:fingers|hands?|palms?)\b|(?:fingers|hands|palms) (?:wide )?(?:spread|open)\b",
+    "pinch": rf"pinch\w*(?: thumb and index finger)? (?:with|of) {_HAND}",
+    "wave_fingers": rf"(?:wiggling|waving) the fingers of {_HAND}",
+}
+"""Phrases about fingers by the shape of the hand; their side is not the action's."""
+_ANIMALS = r"(dog|cat|horse|bird|monkey|bear|lion|tiger|elephant|rabbit|cow|pig|fish|snake|robot)s?"
+"""Who is no person."""
 _COUNTED = ("kick", "punch", "hop", "jump", "squat", "clap")
 _ONES = "two three four five six seven eight nine ten eleven twelve"
 _TENS = "twenty thirty forty fifty sixty seventy eighty ninety"
@@ -65,9 +71,7 @@ class CaptionRequest:
 
 def parse_requests(caption: str) -> CaptionRequest:
     """Return what a caption asks for, as truth records that state no more than it does."""
-    text = caption.lower()
-    for pattern in _FINGERS:
-        text = re.sub(pattern, " ", text)
+    text, hands = _without_hands(caption.lower())
     parts = [part for part in (part.strip(" ,.") for part in re.split(_IN_TURN, text)) if part]
     named = [parse_actions(part) for part in parts]
     actions = tuple(action for own in named for action in own)
@@ -75,12 +79,29 @@ def parse_requests(caption: str) -> CaptionRequest:
         return CaptionRequest()
     if _has(text, _NEGATIONS):
         return CaptionRequest(refused=True, without=actions)
-    if len(actions) > 2:
+    if len(actions) > 2 or _has(text, _ANIMALS):
         return CaptionRequest(refused=True)
+    lasting = re.search(rf"\bfor (?:about )?(\d+|{'|'.join(_NUMBERS)})[ -]seconds?\b", text)
+    whole = hands | ({"seconds": _number(lasting[1])} if lasting else {})
     if len(actions) == 2:
-        return CaptionRequest(({"action": "then", "parts": [{"action": action} for action in actions]},))
+        # Of two in one sentence it is not known which of them a side or a count belongs to.
+        said = parts if len(parts) == 2 else ("", "")
+        each = [attributes_of(part, action) for part, action in zip(said, actions, strict=True)]
+        return CaptionRequest(({"action": "then", "parts": each, **whole},))
     meant = (*actions, "raise") if _has(text, _RAISED.get(actions[0], "(?!)")) else actions
-    return CaptionRequest(tuple(attributes_of(text, action) for action in meant))
+    return CaptionRequest(tuple(attributes_of(text, action) | whole for action in meant))
+
+
+def _without_hands(text: str) -> tuple[str, Record]:
+    """A text without its phrases about fingers, and the shape of each hand that they ask for."""
+    hands: Record = {}
+    for shape, pattern in _FINGERS.items():
+        for found in re.finditer(pattern, text):
+            side = re.search("left|right", found[0])
+            if side or _has(found[0], "both|fists|hands|palms|fingers"):
+                hands |= {f"{one}_hand": shape for one in ([side[0]] if side else ["left", "right"])}
+        text = re.sub(pattern, " ", text)
+    return text, hands
 
 
 def parse_actions(text: str) -> tuple[str, ...]:
@@ -113,6 +134,8 @@ def attributes_of(text: str, action: str) -> Record:
     directions = [name for name, words in _DIRECTIONS.get(action, {}).items() if _has(plain, words)]
     if len(directions) == 1:
         out["direction"] = directions[0]
+        if action == "walk" and directions == ["sideways"] and len(sides) == 1:
+            out["side"] = sides[0]
     elif action in ("walk", "run") and _has(text, "circles?|laps?"):
         out["path"] = "a circle"  # either way round
     count = _count(text, action)
@@ -137,8 +160,12 @@ def _count(text: str, action: str) -> int | None:
         if _has(text, rf"one (\w+ )?({words})|one time"):
             return 1
     found = re.findall(rf"\bx?(\d+|{'|'.join(_NUMBERS)})x?\b{following}", text)
-    numbers = {int(one) if one.isdigit() else _NUMBERS[one] for one in found}
+    numbers = set(map(_number, found))
     return numbers.pop() if len(numbers) == 1 else None
+
+
+def _number(word: str) -> int:
+    return int(word) if word.isdigit() else _NUMBERS[word]
 
 
 def _has(text: str, pattern: str) -> bool:

@@ -18,6 +18,10 @@ def then(*actions: str) -> dict[str, Any]:
     return {"action": "then", "parts": [{"action": action} for action in actions]}
 
 
+FISTS = {"left_hand": "fist", "right_hand": "fist"}
+SLOWLY = {"action": "then", "parts": [{"action": "walk", "speed": "slowly"}, {"action": "wave"}]}
+
+
 @pytest.mark.parametrize(
     ("caption", "asked"),
     [
@@ -26,7 +30,13 @@ def then(*actions: str) -> dict[str, Any]:
         ("two quick left jabs", [{"action": "punch", "side": "left", "count": 2, "speed": "quickly"}]),
         ("jump jump jump", [{"action": "jump", "count": 3}]),
         ("the boxer kicks one time", [{"action": "kick", "count": 1}]),
-        ("he gives it a kick with both hands in fists", [{"action": "kick"}]),
+        ("he gives it a kick with both hands in fists", [{"action": "kick"} | FISTS]),
+        ("squats with clenched fists", [{"action": "squat"} | FISTS]),
+        ("claps, left hand open", [{"action": "clap", "left_hand": "spread"}]),
+        ("side steps to the left", [{"action": "walk", "direction": "sideways", "side": "left"}]),
+        ("a side kick with the left leg", [{"action": "kick", "side": "left", "direction": "sideways"}]),
+        ("walks for ten seconds", [{"action": "walk", "seconds": 10}]),
+        ("walks slowly, then waves twice", [SLOWLY]),
         ("walk and turn right", [{"action": "turn", "direction": "right"}]),
         ("she steps back, taking three steps", [{"action": "walk", "direction": "backward", "count": 3}]),
         ("strolls anti-clockwise", [{"action": "walk", "direction": "counterclockwise"}]),
@@ -51,6 +61,7 @@ def test_what_a_caption_asks_for(caption: str, asked: list[dict[str, Any]]) -> N
         ("he doesn't wave", "wave"),
         ("stop walking", "walk"),
         ("kick, hop, wave", ""),
+        ("a dog runs across the garden", ""),
     ],
 )
 def test_what_is_taken_back_or_too_much_is_refused(caption: str, without: str) -> None:
