@@ -37,6 +37,7 @@ FENCE = (
     "pipeline/editing",
     "pipeline/rigs",
     "pipeline/serve",
+    "pipeline/runs/cluster",
     "pipeline/songs",
     "datasets/convert/sets",
 )

@@ -30,6 +30,14 @@ Sets = Annotated[
     list[str] | None,
     typer.Option("--set", "-s", help="Override one value: stage.field=value. May be repeated."),
 ]
+GoOn = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--go-on",
+        metavar="STAGE",
+        help="Go on with this training's weights although its optim, loss or train settings changed.",
+    ),
+]
 At = Annotated[
     str | None,
     typer.Option(
