@@ -113,10 +113,10 @@ def find_mismatch(requests: Sequence[Record], joints: NDArray[np.floating], fps:
     if abs(len(joints) / fps - asked.get("seconds", len(joints) / fps)) > _LENGTH:
         return f"it lasts {len(joints) / fps:.1f} s, not {asked['seconds']}"
     for side, name in enumerate(SIDES):
-        wanted = asked.get(f"{name}_hand")
-        shape = hand_shape(joints, side, fps) if wanted and joints.shape[1] >= 52 else wanted
-        if shape != wanted:
-            return f"the {name} hand is {_SHAPES.get(shape, shape)}, not {_SHAPES[wanted]}"
+        meant = asked.get(f"{name}_hand")
+        shape = hand_shape(joints, side, fps) if meant and joints.shape[1] >= 52 else meant
+        if shape != meant:
+            return f"the {name} hand is {_SHAPES.get(shape, shape)}, not {_SHAPES[meant]}"
     if len(actions_of(asked)) > 1:
         # Where the first ends is not known: something is wrong that is so wherever the motion is cut.
         held = agrees(asked, joints, None, fps)
