@@ -114,6 +114,9 @@ def run(
     verify: Annotated[
         bool, typer.Option("--verify", help="First compare all files of finished stages with their sha256.")
     ] = False,
+    mirror: Annotated[
+        str | None, typer.Option(help="Bucket (s3://BUCKET/RUN) that keeps the run, and gives it back.")
+    ] = None,
 ) -> None:
     """Run a recipe: every stage that is not finished, in order.
 
@@ -130,6 +133,8 @@ def run(
     Example: `motionloom run humantomato-tiny --set face_gpt.train.steps=900 --replace`
 
     Example: `motionloom run humantomato-tiny --set gpt.optim.lr=1e-4 --go-on gpt`
+
+    Example: `motionloom run humantomato-tiny --mirror s3://my-bucket/runs/first`
     """
     from motionloom.pipeline.runs.layers import require_recipe
 
@@ -147,6 +152,7 @@ def run(
         sizes=sizes,
         replace=replace,
         verify=verify,
+        mirror=mirror,
         console=make_console(),
     )
 

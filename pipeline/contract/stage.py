@@ -191,6 +191,8 @@ class StageContext:
     drawn."""
     begun: Callable[[], None] = _nothing
     """Called by a training once its checkpoint has been loaded: until then the folder says what it said."""
+    saved: Callable[[], None] = _nothing
+    """Called by the lead when another checkpoint is on disk."""
 
     @property
     def units(self) -> Units:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import shutil
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
 from rich.console import Console
@@ -25,6 +26,7 @@ from motionloom.pipeline.launch.process import beside, process_rank, take_place
 from motionloom.pipeline.launch.team import Team
 from motionloom.pipeline.runs.dry_run import explain_replacements, plan_table, replaced_stages, say_estimate
 from motionloom.pipeline.runs.execute import context_of, execute, facts_of, perform
+from motionloom.pipeline.runs.mirror import Mirror
 from motionloom.pipeline.runs.plan import Selection, doubts, make_plan, require_fit, selected
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.runs.snapshot import run_at
@@ -45,12 +47,14 @@ def run_recipe(
     sizes: bool = False,
     replace: bool = False,
     verify: bool = False,
+    mirror: str | None = None,
     console: Console | None = None,
 ) -> Path:
     """Run what is not finished; returns the run folder. With `dry_run` only the plan is printed, with `sizes`
     too what its trainings take (some seconds each the first time, then remembered).
 
-    With `verify` all files of finished stages are compared with their checksums first.
+    With `verify` all files of finished stages are compared with their checksums first. What `mirror` has of
+    the run is fetched before, and what is made is put there (`mirror.py`).
 
     Without `replace`, a run that would replace work that took long (`dry_run.py`), or that would write into
     the folder of another recipe's run, is refused. Trainings in `go_on` go on from their newest checkpoints
@@ -65,6 +69,12 @@ def run_recipe(
         count = sum(require_unchanged(stage_folder(run, stage.name), again=True) for stage in loaded.stages)
         say(console, f"{run}: {count} files have the sha256 that their stages noted")
     dry_run = dry_run or sizes
+    chosen = selected(loaded, select or Selection())
+    if mirror is not None and loaded.hardware.nodes > 1:
+        raise UserError("--mirror serves one machine, and hardware.nodes is more: give them a shared folder")
+    copies = None if mirror is None or dry_run else Mirror(mirror, run, console)
+    if copies is not None:
+        copies.fetch(sorted(chosen))
     try:
         plan = make_plan(loaded, run, select, go_on)
     except UserError:
@@ -90,7 +100,6 @@ def run_recipe(
     if dry_run:
         say(console, f"{len(todo)} of {len(plan)} stages would run in {run}")
         return run
-    chosen = selected(loaded, select or Selection())
     if todo:
         message = (
             f"{loaded.name} in {run}: {len(todo)} of {len(plan)} stages to run "
@@ -101,14 +110,23 @@ def run_recipe(
     else:
         message = f"{run}: all {len(plan)} stages are finished, nothing to do"
     say(console, message)
-    if todo or beside() > 1:  # one that has another recipe may think that nothing is to do
-        execute(loaded, run, plan, console)
+    with copies or nullcontext():
+        send = _nowhere if copies is None or process_rank() > 0 else copies.send
+        for row in plan:
+            if row.action == "skip":
+                send(row.stage.name)
+        if todo or beside() > 1:  # one that has another recipe may think that nothing is to do
+            execute(loaded, run, plan, console, send)
     for row in plan:
         page = stage_folder(run, row.stage.name) / "report.html"
         # Not the page of an earlier run with other settings.
         if "page" in row.stage.kind.gives(row.stage.config) and row.action != "leave" and page.is_file():
             say(console, f"watch it: {page.resolve()}")
     return run
+
+
+def _nowhere(stage: str) -> None:
+    """Send nothing: there is no mirror, or the lead has it."""
 
 
 def _stages_again(

@@ -44,11 +44,18 @@ _DRAWING = (sys.executable, "-P", "-m", "motionloom.pipeline.runs.samples")
 """Draws motions of a training's newest checkpoint, in a process of its own."""
 
 
-def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Console) -> list[str]:
+def execute(
+    recipe: Recipe,
+    run: Path,
+    plan: Sequence[PlannedStage],
+    console: Console,
+    send: Callable[[str], None] = lambda stage: None,
+) -> list[str]:
     """Run the plan; returns the names of the stages that ran. Safe to kill and start again at any moment.
 
     With several processes each calls this with the same plan: the lead runs and writes everything, the others
-    only take part in trainings and in stages that share their work, and return after the last one.
+    only take part in trainings and in stages that share their work, and return after the last one. The lead
+    calls `send` with a stage when it has begun, has another checkpoint and is finished.
     """
     todo = [row for row in plan if row.action in {"run", "resume"}]
     if recipe.hardware.part is not None:
@@ -82,7 +89,8 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
                 _prepare(folder, row)
             context = context_of(recipe, run, stage, folder, console, team)
             if leads:
-                context = replace(context, begun=partial(_note, folder, row))
+                send(stage.name)
+                context = replace(context, begun=partial(_note, folder, row), saved=partial(send, stage.name))
             perform(stage.kind, context, team, run)
             if leads:
                 seconds = time.perf_counter() - begin
@@ -90,6 +98,7 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
                 write_json(folder / "timing.json", took)
                 # Last of all: a stage is finished when its artifact is there.
                 _artifact(recipe, run, row, plan).finish(folder)
+                send(stage.name)
                 console.print(f"    finished in {seconds:.1f} s")
         if leads:
             (run / REQUEST_FILE).unlink(missing_ok=True)

@@ -374,6 +374,7 @@ class Training(L.Callback):
             self._writing = False
             self.metrics.saved(self._saved)
             self.samples.saved(self._saved)
+            self.context.saved()
 
 
 def _numbers(values: dict[str, Tensor] | dict[str, float | Tensor]) -> dict[str, float]:

@@ -1,0 +1,130 @@
+"""`motionloom run --mirror s3://bucket/run`: what of a run must not be lost with its machine, in a bucket.
+
+Every finished stage and each checkpoint is put there in the background. A machine with an empty disk begins
+by fetching what its stages need, and goes on with the same bytes. A training's folder there is, at any
+moment, of one `started.json`: what others have left goes before it comes, and a checkpoint that is rotated
+away goes behind the newer one. `artifact.json` comes last and goes first, here and there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.files import sha256_of, temporary_folder
+from motionloom.datasets.base.lock import LOCK_FILE, file_lock
+from motionloom.datasets.shards.store import open_store, read_stored
+from motionloom.pipeline.launch.console import say
+from motionloom.pipeline.store.artifact import FILE_NAME
+from motionloom.pipeline.training.checkpointing import step_of
+
+STARTED = "started.json"
+_PASSING = {"checkpoints", "flight", "samples"}
+"""What a finished stage has no need of."""
+_LAST = (STARTED, FILE_NAME)
+
+
+class Mirror:
+    """The mirror of one run. As a context it ends when all that was due lies there."""
+
+    def __init__(self, place: str, run: Path, console: Console) -> None:
+        self.store = open_store(place)
+        if self.store.place.startswith("http"):
+            raise UserError(f"{place}: a web server is only read; name a bucket or a folder")
+        self._run = run
+        self._console = console
+        self._threads = ThreadPoolExecutor(1)
+        self._due: set[str] = set()
+        self._sent: dict[str, Future[None]] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._threads.shutdown()
+        failed = next(filter(None, (sent.exception() for sent in self._sent.values())), None)
+        if failed is not None and error is None:
+            raise UserError(f"{failed}; the run is whole in {self._run}: the same command sends the rest")
+
+    def fetch(self, stages: Iterable[str]) -> None:
+        """Fetch stages that are further there than here, unless they are begun here with other settings."""
+        self._run.mkdir(parents=True, exist_ok=True)
+        with file_lock(self._run / LOCK_FILE):  # all processes of the machine ask for it
+            for stage in stages:
+                self._fetch(f"stages/{stage}")
+
+    def _fetch(self, folder: str) -> None:
+        here = self._run / folder
+        if (here / FILE_NAME).exists():
+            return
+        there = [name.removeprefix(f"{folder}/") for name in self.store.names(folder)]
+        if STARTED not in there:
+            return
+        begun = here / STARTED
+        if begun.exists():
+            mine = [path.name for path in here.glob("checkpoints/*")]
+            is_newer = FILE_NAME in there or _newest(there) > _newest(mine)
+            if not is_newer or begun.read_bytes() != read_stored(self.store, f"{folder}/{STARTED}"):
+                return
+        say(self._console, f"{self._run}: {folder} is fetched from {self.store.place}")
+        for name in sorted(there, key=_order):
+            self.store.get(f"{folder}/{name}", here / name)
+
+    def send(self, stage: str) -> None:
+        """Have the state of a stage put there soon."""
+        if stage not in self._due:
+            self._due.add(stage)
+            self._sent[stage] = self._threads.submit(self._send, stage)
+
+    def _send(self, stage: str) -> None:
+        self._due.discard(stage)
+        prefix = f"stages/{stage}/"
+        (self._run / ".mirror").mkdir(exist_ok=True)
+        with temporary_folder(self._run / ".mirror") as kept:
+            files = _stage_files(self._run / prefix, kept)
+            sums = {name: sha256_of(files[name]) for name in sorted(files, key=_order)}
+            there = [name.removeprefix(prefix) for name in self.store.names(prefix)]
+            gone = sorted({*there} - {*files}, key=_order, reverse=True)
+            is_same = self.store.digest(prefix + STARTED) == sums.get(STARTED)
+            for name in () if is_same else gone:
+                self.store.remove(prefix + name)
+            if FILE_NAME in sums and self.store.digest(prefix + FILE_NAME) == sums[FILE_NAME]:
+                return
+            for name, digest in sums.items():
+                if self.store.digest(prefix + name) != digest:
+                    self.store.put(files[name], prefix + name, digest)
+            for name in gone if is_same else ():
+                self.store.remove(prefix + name)
+
+
+def _stage_files(stage: Path, kept: Path) -> dict[str, Path]:
+    """The files of a stage that are needed elsewhere: of a finished one its own, else the newest checkpoint.
+
+    What may be replaced or rotated away meanwhile has a second name in the folder `kept`.
+    """
+    found = [path for path in stage.rglob("*") if path.is_file() and path.name[0] != "."]
+    names = {path.relative_to(stage).as_posix(): path for path in found}
+    if FILE_NAME in names:
+        return {name: path for name, path in names.items() if name.split("/")[0] not in _PASSING}
+    newest = sorted(name for name in names if step_of(names[name]) is not None)[-1:]
+    for name in (*newest, STARTED):
+        with suppress(FileNotFoundError):  # the newer one is due
+            (kept / Path(name).name).hardlink_to(stage / name)
+    return {name: kept / Path(name).name for name in (*newest, STARTED) if (kept / Path(name).name).exists()}
+
+
+def _newest(names: Iterable[str]) -> int:
+    return max((step_of(Path(name)) or 0 for name in names), default=0)
+
+
+def _order(name: str) -> int:
+    return _LAST.index(name) + 1 if name in _LAST else 0
