@@ -15,14 +15,15 @@ from fuzzing.mutations import damaged_json, damaged_yaml
 from fuzzing.sealed import damaged_tar, damaged_zip
 from fuzzing.table import Read, Seed, of_files, of_tree, reader
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.base.records import Decisions
+from motionloom.datasets.base.records import Column, Decisions
 from motionloom.datasets.check.dataset import examine
 from motionloom.datasets.convert.common.removed import Removed
 from motionloom.datasets.shards.finish import join_parts
 from motionloom.datasets.shards.index import ShardIndex
-from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.shards.reader import ShardDataset, load_manifest
 from motionloom.datasets.shards.tar import scan_tar
 from motionloom.pipeline.contract.lookup import finished_stages
+from motionloom.pipeline.curation.add_command import add
 from motionloom.pipeline.curation.search import _stored
 from motionloom.pipeline.editing.task import EditTask
 from motionloom.pipeline.evaluation.figures import FigureFile
@@ -77,6 +78,25 @@ def _shard(folder: Path) -> Made:
         return clips
 
     return of_tree(root, {".tar": damaged_tar}, read)
+
+
+@reader("column", "shards/columns.py", "check/columns.py", "check/shard.py", "curation/add_command.py")
+def _column(folder: Path) -> Made:
+    root = _shards(folder)
+    (folder / "more.jsonl").write_text('{"id": "clip-ä-1", "captions": ["more"]}')
+    add(str(root), folder / "more.jsonl")
+
+    def read(file: str) -> object:
+        if file.endswith(".json"):
+            return Column.load_json(root / file).fits(load_manifest(root).shards)
+        if file.endswith(".tar"):
+            scan_tar(root / file, column="more.json")
+        if found := examine(root).errors:
+            raise UserError(str(found[0]))
+        return _opened(root)
+
+    damages = {"column.json": damaged_json, "index.npz": damaged_zip, ".tar": damaged_tar}
+    return of_tree(root / "columns", damages, lambda file: read(f"columns/{file}"))
 
 
 @reader(

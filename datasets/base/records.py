@@ -6,12 +6,14 @@ Everything read from outside (`meta.json`, `manifest.json`) passes through one o
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BeforeValidator, Field, PlainSerializer
 
 from motionloom.datasets.base.config import Config, FrameRate
+from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.base.json_doors import MOST, parse_json
 
 SCHEMA_VERSION = 3
@@ -31,6 +33,8 @@ CLEANED_FILE = "cleaned.json"
 """Beside them where somebody has cleaned the set."""
 REMOVED_FILE = "removed.json"
 """Beside them where clips were removed from the set."""
+COLUMNS, COLUMN_FILE = "columns", "column.json"
+"""Folder of the columns that were added to the set; in the folder of each there is its record."""
 
 # Readers that infer columns from the first rows (Arrow, so Hugging Face `datasets`) refuse a field that is
 # null or of other keys there and filled later: what a clip does not have is stored as a value of its type.
@@ -139,6 +143,48 @@ class ShardInfo(Config):
     sha256: str
 
 
+class Column(Config):
+    """A column that was added beside a set's clips: one more member of each, in a tar beside each shard."""
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]{0,39}$")
+    member: str
+    """`NAME.json` holds captions, `NAME.npy` numbers."""
+    shards: list[ShardInfo]
+    """Its tars, in the order of the manifest's shards; each has the keys of its shard."""
+    beside: str
+    """Digest of the shards that it was made for."""
+    index: str
+    """sha256 of its `index.npz`."""
+    clips: int
+    """Clips with a value."""
+    gone: int = 0
+    """Values that no clip of the set has, or has any more."""
+
+    def file(self, name: str) -> str:
+        """A file of its folder, as seen from the set's."""
+        return f"{COLUMNS}/{self.name}/{name}"
+
+    def tars(self, split: Split) -> list[ShardInfo]:
+        """Its tars of a split."""
+        return [tar for tar in self.shards if tar.split == split]
+
+    def feeds(self, member: str) -> bool:
+        """Whether its values are those of a clip's member: all captions are, but for `face_texts`."""
+        is_text = self.member.endswith(".json") and self.name != "face_texts"
+        return member == ("texts.json" if is_text else self.member)
+
+    def fits(self, shards: Sequence[ShardInfo]) -> bool:
+        """Whether it was made for these shards."""
+        own = [(shard.name, shard.split, shard.samples) for shard in self.shards]
+        wanted = [(self.file(shard.name), shard.split, shard.samples) for shard in shards]
+        return self.beside == beside(shards) and own == wanted
+
+
+def beside(shards: Sequence[ShardInfo]) -> str:
+    """The digest of shards that a column is made for."""
+    return sha256_of_json([[shard.name, shard.sha256] for shard in shards])
+
+
 class Dropped(Config):
     """A source clip that did not become a sample, and why."""
 
@@ -174,6 +220,13 @@ class Manifest(Config):
     notes: list[str] = Field(default_factory=list)
     excluded: dict[str, str] = Field(default_factory=dict)
     """Ids of clips that readers skip, and why: what `motionloom data clean` was told to leave out."""
+    columns: list[Column] = Field(default_factory=list, exclude_if=lambda columns: not columns)
+    """What `motionloom data add` has put beside the shards."""
+
+    @property
+    def tars(self) -> list[ShardInfo]:
+        """All tars: shards, and those of columns."""
+        return [*self.shards, *(tar for column in self.columns for tar in column.shards)]
 
 
 class Decisions(Config):

@@ -139,6 +139,14 @@ def check_clip(
     return CheckedClip(meta, motion, _check_audio(file, path, clip), oddities)
 
 
+def check_value(where: str, raw: bytes, seconds: float) -> Iterator[tuple[str, str]]:
+    """The same of a column's value, captions or an array; one without rows stands for none."""
+    if where.endswith(".json"):
+        yield from _check_captions(where, captions_from_json(raw, where), seconds)
+    elif (values := npy_from_bytes(raw, where)).size:
+        require_sensible(where, values.reshape(len(values), -1))
+
+
 def _check_captions(name: str, captions: list[Caption], seconds: float) -> Iterator[tuple[str, str]]:
     """Raises for captions nobody can train on; yields those that reach past the clip."""
     for number, caption in enumerate(captions, start=1):

@@ -14,12 +14,19 @@ from typing import NamedTuple
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of, temporary_folder
 from motionloom.datasets.base.progress import Meter
-from motionloom.datasets.base.records import CLEANED_FILE, INDEX_FILE, MANIFEST_FILE, REMOVED_FILE, Manifest
+from motionloom.datasets.base.records import (
+    CLEANED_FILE,
+    COLUMN_FILE,
+    INDEX_FILE,
+    MANIFEST_FILE,
+    REMOVED_FILE,
+    Manifest,
+)
 from motionloom.datasets.shards.card import CARD_FILE
 from motionloom.datasets.shards.index import index_path
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE
 from motionloom.datasets.shards.reader import read_manifest
-from motionloom.datasets.shards.store import LocalStore, MissingFileError, Store, open_store, persist
+from motionloom.datasets.shards.store import LocalStore, MissingFileError, Store, open_store
 
 _BESIDE = (CARD_FILE, LEFT_OUT_FILE, CLEANED_FILE, REMOVED_FILE)
 _AT_ONCE = 16
@@ -41,12 +48,12 @@ def copy_dataset(source: str, target: str, *, progress: bool = False) -> Copied:
         raise UserError(f"{target}: a web server is only read; name a folder, s3://… or hf://datasets/…")
     manifest, digest = read_manifest(here)
     _remove_older(there, manifest, digest)
-    sums = {shard.name: shard.sha256 for shard in manifest.shards}
+    sums = {tar.name: tar.sha256 for tar in manifest.tars}
     # Without the others of these a data set can be read; `data convert` and `data clean` go on with them. Who
     # was removed is nothing to publish, though it is hashed: names can be tried.
     needed = {*sums, INDEX_FILE}
     beside = [name for name in _BESIDE if name != REMOVED_FILE or not there.place.startswith("hf:")]
-    names = [*sums, *map(_index_name, sums), *beside, INDEX_FILE]
+    names = [*_named(manifest), *beside, INDEX_FILE]
     sent = kept = 0
     with temporary_folder() as folder, Meter("copying", len(names) + 1, shown=progress) as meter:
 
@@ -74,8 +81,8 @@ def _remove_older(there: Store, manifest: Manifest, digest: str) -> None:
     old, _ = read_manifest(there)
     if old.name != manifest.name:
         raise UserError(f"{there.place}: holds data set '{old.name}', not '{manifest.name}'; name another")
-    gone = sorted({shard.name for shard in old.shards} - {shard.name for shard in manifest.shards})
-    for name in (*map(_index_name, gone), *gone, *_BESIDE, MANIFEST_FILE):
+    gone = sorted({*_named(old)} - {*_named(manifest)})
+    for name in (*gone, *_BESIDE, MANIFEST_FILE):
         if there.digest(name) is not None:
             there.remove(name)
 
@@ -95,18 +102,21 @@ def _send_file(here: Store, there: Store, name: str, wanted: str | None, folder:
         if not path.is_file():
             raise MissingFileError(f"{source}: no such file")
     else:
-        persist(source, lambda: here.system().get_file(source, str(path)))
+        here.get(name, path)
     if sha256_of(path) != wanted:
         raise UserError(f"{source}: the sha256 is not the manifest's: damaged; nothing of it is copied")
     try:
         there.put(path, name, wanted)
     finally:
-        if path.parent == folder:
+        if path.is_relative_to(folder):
             path.unlink()
     if there.digest(name) != wanted:
         raise UserError(f"{there.where(name)}: is not what was sent, by its sha256; give the command again")
     return True
 
 
-def _index_name(shard: str) -> str:
-    return index_path(Path(shard)).name
+def _named(manifest: Manifest) -> list[str]:
+    """The files of shards and columns."""
+    indices = [index_path(Path(shard.name)).name for shard in manifest.shards]
+    about = [column.file(name) for column in manifest.columns for name in (INDEX_FILE, COLUMN_FILE)]
+    return [*(tar.name for tar in manifest.tars), *indices, *about]

@@ -14,11 +14,12 @@ from pathlib import Path
 
 from pydantic import Field
 
-from motionloom.datasets.base.config import Config, require_local
+from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import remove_temporaries, sync_folder, write_json
 from motionloom.datasets.base.lock import folder_lock
 from motionloom.datasets.base.records import (
+    INDEX_FILE,
     MANIFEST_FILE,
     SPLITS,
     Decisions,
@@ -27,11 +28,14 @@ from motionloom.datasets.base.records import (
     ShardInfo,
     Split,
 )
-from motionloom.datasets.shards.card import write_card
+from motionloom.datasets.shards.card import CARD_FILE, write_card
+from motionloom.datasets.shards.columns import carry_over, drop_columns
 from motionloom.datasets.shards.index import ShardIndex, SplitIndex, index_path, save_index
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, write_left_out
 from motionloom.datasets.shards.options import SOURCE_CHECKSUM, Part
 from motionloom.datasets.shards.sample import MEMBERS
+from motionloom.datasets.shards.staging import put, staged
+from motionloom.datasets.shards.store import RemoteStore
 from motionloom.datasets.shards.tasks import Result, finished_shard
 
 OLD_FOLDER = ".old"
@@ -65,20 +69,36 @@ class Planned(Config):
         )
 
 
-def write_record(out: Path, part: Part, planned: Planned) -> None:
-    """Write a part's record, unless the set is joined already."""
+def write_record(out: Path, part: Part, planned: Planned) -> str:
+    """Write a part's record, unless the set is joined already; return its name."""
+    name = f"{PARTS_FOLDER}/{part.number}-of-{part.count}.json"
     if not (out / MANIFEST_FILE).exists():
-        write_json(out / PARTS_FOLDER / f"{part.number}-of-{part.count}.json", planned.dump())
+        write_json(out / name, planned.dump())
+    return name
 
 
-def join_parts(out: Path) -> Manifest:
-    """Make one data set of the finished parts in `out`; one that is joined already is left as it is.
+def join_parts(place: Path | str) -> Manifest:
+    """Make one data set of the finished parts in a folder or bucket; one that is joined already is left as it
+    is.
 
     `UserError` for parts that are missing, unfinished, or made of other sources or with other settings.
     """
-    require_local(out)
-    if not out.is_dir():
-        raise UserError(f"{out}: no such folder")
+    with staged(place) as (out, store):
+        if not out.is_dir():
+            raise UserError(f"{out}: no such folder")
+        manifest = _join(out, store)
+        if store is not None:
+            put(store, out, CARD_FILE, LEFT_OUT_FILE, INDEX_FILE, MANIFEST_FILE)
+            keep = {tar.name for tar in manifest.tars}
+            for name in store.names(""):
+                shard = name.removesuffix(".index").removesuffix(".tar")
+                is_stray = _is_shard(manifest.name, f"{shard}.tar") and f"{shard}.tar" not in keep
+                if is_stray or name.startswith(f"{PARTS_FOLDER}/"):
+                    store.remove(name)
+        return manifest
+
+
+def _join(out: Path, store: RemoteStore | None) -> Manifest:
     with folder_lock(out):
         records = {
             Part.parse(path.stem.replace("-of-", "/")): Planned.load_json(path)
@@ -91,7 +111,7 @@ def join_parts(out: Path) -> Manifest:
         planned = _require_one_plan(out, records)
         with ThreadPoolExecutor() as threads:  # hashing runs outside the interpreter's lock
             fingerprints = planned.fingerprints.items()
-            results = list(threads.map(lambda shard: finished_shard(out / shard[0], shard[1]), fingerprints))
+            results = list(threads.map(lambda one: finished_shard(out / one[0], one[1], store), fingerprints))
         count = max(part.count for part in records)
         missing = _missing(results, count)
         if missing:
@@ -100,7 +120,10 @@ def join_parts(out: Path) -> Manifest:
                 f"{out}: part {', '.join(parts)} {'is' if len(parts) == 1 else 'are'} missing or not "
                 f"finished: give the same data convert … --part {parts[0]}"
             )
-        remove_strays(out, planned)
+        if store is None:
+            remove_strays(out, planned)
+        else:
+            drop_columns(out, planned.with_results([one for one in results if one is not None]).shards)
         return finish(out, planned, [result for result in results if result is not None])
 
 
@@ -159,6 +182,8 @@ def finish(out: Path, planned: Planned, results: Sequence[Result]) -> Manifest:
         raise UserError(f"{out}: no clip survived the conversion ({some}){where}")
     # The index is written before the manifest: whoever sees a manifest finds everything that it names.
     splits, made_on = _finish_index(out, manifest.shards)
+    columns = carry_over(out, out / OLD_FOLDER, manifest.shards)
+    manifest = manifest.model_copy(update={"columns": columns})
     if len(made_on) > 1:
         kinds = f"{len(made_on)} kinds of processor ({', '.join(sorted(made_on))})"
         note = f"made on {kinds}: the last digits of clips may differ from those of a set made on one"
@@ -191,10 +216,14 @@ def remove_strays(out: Path, planned: Planned) -> None:
 
 def shards_in(folder: Path, name: str, *suffixes: str) -> list[Path]:
     """Shards of the data set `name`, or their indices."""
-    shard = re.compile(
-        rf"{re.escape(name)}-({'|'.join(SPLITS)})-\d{{6,}}({'|'.join(map(re.escape, suffixes))})"
-    )
-    return [path for path in folder.iterdir() if shard.fullmatch(path.name)] if folder.is_dir() else []
+    if not folder.is_dir():
+        return []
+    return [path for path in folder.iterdir() if _is_shard(name, path.name, *suffixes)]
+
+
+def _is_shard(name: str, file: str, *suffixes: str) -> bool:
+    ends = "|".join(map(re.escape, suffixes or (".tar",)))
+    return re.fullmatch(rf"{re.escape(name)}-({'|'.join(SPLITS)})-\d{{6,}}({ends})", file) is not None
 
 
 def _finish_index(out: Path, shards: Sequence[ShardInfo]) -> tuple[Collection[SplitIndex], set[str]]:

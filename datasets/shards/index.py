@@ -21,7 +21,7 @@ Arrays, n clips of a split and M = `len(MEMBERS)`:
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -33,9 +33,10 @@ from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import write_bytes
 from motionloom.datasets.base.json_doors import open_plain
-from motionloom.datasets.base.records import INDEX_FILE, PRESENT_ALL, Dropped, ShardInfo, Split
+from motionloom.datasets.base.records import INDEX_FILE, PRESENT_ALL, Column, Dropped, ShardInfo, Split
 from motionloom.datasets.motion.npz import NpzFile, read_npy_header
 from motionloom.datasets.shards.sample import MEMBERS
+from motionloom.datasets.shards.store import Store
 from motionloom.datasets.shards.tar import TarClip, scan_tar
 
 _ARRAYS: dict[str, tuple[type[np.generic], int]] = {
@@ -286,3 +287,36 @@ def _outside(index: SplitIndex, shards: list[ShardInfo], firsts: NDArray[np.int6
         wrong |= np.maximum.reduceat(start + index.sizes[:, column], firsts) > size
     wrong |= (np.minimum.reduceat(index.data, firsts) < 0) | (np.maximum.reduceat(index.data, firsts) > size)
     return wrong
+
+
+class SideColumn:
+    """A column beside the shards (`columns.py`) in one split; its rows are those of the split's index.
+
+    `read` takes shard, start and size.
+    """
+
+    def __init__(
+        self, column: Column, store: Store, split: Split, read: Callable[[int, int, int], bytes]
+    ) -> None:
+        self.column = column
+        self._read = read
+        where = store.where(column.file(INDEX_FILE))
+        tars = column.tars(split)
+        ends = np.repeat([tar.bytes for tar in tars], [tar.samples for tar in tars])
+        limit = 8 * len(ends) + 4096
+        with store.open_index(column.index, column.file(INDEX_FILE)) as file, NpzFile(file, where) as stored:
+            self._offsets = offsets = stored.array(f"{split}.offsets", limit=limit)
+            self.sizes = stored.array(f"{split}.sizes", limit=limit)
+        fits = offsets.dtype == np.int64 and self.sizes.dtype == np.uint32
+        # Compared once for all clips, so that reading one needs no checks.
+        if not (fits and offsets.shape == self.sizes.shape == ends.shape) or (
+            ((offsets < 0) | (offsets > ends) | (offsets + self.sizes > ends)).any()
+        ):
+            raise UserError(
+                f"{where}: does not fit its tars; remove column '{column.name}', and add it again"
+            )
+
+    def value(self, shard: int, row: int) -> bytes:
+        """The value of a clip; empty where it has none."""
+        size = int(self.sizes[row])
+        return self._read(shard, int(self._offsets[row]), size) if size else b""

@@ -18,7 +18,7 @@ import re
 import resource
 from bisect import bisect_right
 from collections import OrderedDict, deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from functools import cache, cached_property
 from itertools import accumulate
@@ -47,7 +47,7 @@ from motionloom.datasets.base.register import discover
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.shards.checksums import LocalShard, require_intact
 from motionloom.datasets.shards.clips import ClipDataset, Source
-from motionloom.datasets.shards.index import read_index
+from motionloom.datasets.shards.index import SideColumn, read_index
 from motionloom.datasets.shards.options import Reading
 from motionloom.datasets.shards.sample import MEMBERS, captions_from_json, meta_from_json
 from motionloom.datasets.shards.store import LocalStore, MissingFileError, Store, open_store
@@ -110,6 +110,11 @@ def read_manifest(store: Store, digest: str | None = None) -> tuple[Manifest, st
     for shard in manifest.shards:
         if not _SHARD_NAME.fullmatch(shard.name) or f"-{shard.split}-" not in shard.name:
             raise UserError(f"{where}: '{shard.name}' is not the name of a shard of split '{shard.split}'")
+    for column in manifest.columns:
+        if not column.fits(manifest.shards):
+            raise UserError(
+                f"{where}: column '{column.name}' is of other shards; remove it, and add it again"
+            )
     return manifest, hashlib.sha256(raw).hexdigest()
 
 
@@ -215,6 +220,10 @@ class ShardDataset:
             self._rows = self._rows[np.array(kept, dtype=np.bool_)]
         room = 0 if isinstance(store, LocalStore) else reading.cache.limit
         self._access = OpenShards(store, self._shards, room)
+        self._columns = [
+            SideColumn(column, store, split, OpenShards(store, column.tars(split), room).read)
+            for column in manifest.columns
+        ]
 
     @staticmethod
     def open(
@@ -236,8 +245,9 @@ class ShardDataset:
         if not shards:
             raise UserError(f"{store.place}: split '{split}' has no clips")
         if isinstance(store, LocalStore):
-            for shard in shards:
-                require_intact(LocalShard(store.root / shard.name, shard), content=False)
+            for tar in manifest.tars:
+                if tar.split == known:
+                    require_intact(LocalShard(store.root / tar.name, tar), content=False)
         dataset = ShardDataset(store, known, manifest, digest, reading, every)
         dataset._check_motion_sizes()
         return dataset
@@ -258,7 +268,13 @@ class ShardDataset:
         return [self._index.id(row) for row in self._rows.tolist()]
 
     def has(self, member: str) -> NDArray[np.bool_]:
-        return np.asarray(self._index.sizes[self._rows, MEMBERS.index(member)] > 0, dtype=np.bool_)
+        held = np.zeros(len(self._index), dtype=np.bool_)
+        if member in MEMBERS:
+            held |= self._index.sizes[:, MEMBERS.index(member)] > 0
+        for side in self._columns:
+            if side.column.feeds(member):
+                held |= side.sizes > 0
+        return held[self._rows]
 
     def motion(self, i: int, first: int = 0, end: int | None = None) -> NDArray[np.float32]:
         """Features of clip `i`, [T, D], or of its frames `first .. end`; read-only if float32 is stored."""
@@ -281,8 +297,9 @@ class ShardDataset:
         return self._captions(i, "face_texts.json")
 
     def array(self, i: int, member: str) -> NDArray[np.float32] | None:
-        raw = self._member(i, member)
-        return npy_from_bytes(raw, self._where(i, member)).astype(np.float32) if raw else None
+        for raw in self._values(i, member):
+            return npy_from_bytes(raw, self._where(i, member)).astype(np.float32)
+        return None
 
     def wav(self, i: int) -> tuple[NDArray[np.float32], int] | None:
         raw = self._member(i, "audio.flac")
@@ -297,8 +314,8 @@ class ShardDataset:
         return signal, int(rate)
 
     def _captions(self, i: int, member: str) -> list[Caption]:
-        raw = self._member(i, member)
-        return captions_from_json(raw, self._where(i, member)) if raw else []
+        where = self._where(i, member)
+        return [one for raw in self._values(i, member) for one in captions_from_json(raw, where)]
 
     def sources(self, clips: NDArray[np.int64] | None = None) -> tuple[Source, ...]:
         """One source: `clips` (all when None), with their shards if the order is the streamed one."""
@@ -318,6 +335,15 @@ class ShardDataset:
 
     def parts(self) -> list[tuple[ClipDataset, float]]:
         return [(self, 1.0)]
+
+    def _values(self, i: int, member: str) -> Iterator[bytes]:
+        """The clip's own value of a member, and those of the columns that feed it, where there are any."""
+        if member in MEMBERS and (raw := self._member(i, member)):
+            yield raw
+        row = self._row(i)
+        for side in self._columns:
+            if side.column.feeds(member) and (raw := side.value(self._shard_of(row), row)):
+                yield raw
 
     def _member(self, i: int, member: str) -> bytes:
         column = MEMBERS.index(member)

@@ -16,23 +16,23 @@ import re
 import shutil
 import time
 from collections.abc import Callable
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar, cast
 from urllib.parse import unquote, urlsplit
 
+from motionloom.datasets.base.connection import connect
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.base.files import atomic_file, sha256_of
+from motionloom.datasets.base.files import atomic_file, atomic_path, sha256_of, temporary_folder, write_json
 from motionloom.datasets.base.json_doors import open_plain, read_plain
 from motionloom.datasets.base.places import no_such_folder
 from motionloom.datasets.base.records import INDEX_FILE, MANIFEST_FILE, ShardInfo
 from motionloom.datasets.shards.cache import CacheConfig, FileCache
 from motionloom.datasets.shards.checksums import LocalShard, fault_of
 
-SCHEMES = ("file", "http", "https", "s3", "hf")
+SCHEMES = ("file", "http", "https", "s3", "gs", "az", "hf")
 
-_CONNECT_SECONDS = 15
-_READ_SECONDS = 60
+_SETTINGS = ("AWS_", "AZURE_", "GOOGLE_", "HF_", "STORAGE_")
+"""What variables of the environment begin with that a connection goes by."""
 _LARGEST_PUT = 5 << 30
 """Bytes of an object that S3 takes in one piece, and so has one sha256 of."""
 
@@ -94,14 +94,14 @@ class LocalStore:
         except OSError as error:
             raise UserError(f"{where}: cannot be read ({error})") from None
 
-    def open_index(self, digest: str) -> BinaryIO:
-        """`index.npz` of the manifest with that sha256, seekable."""
+    def open_index(self, digest: str, name: str = INDEX_FILE) -> BinaryIO:
+        """`index.npz` of the manifest with that sha256, or another that `digest` decides, seekable."""
         try:
-            return open_plain(self.root / INDEX_FILE, self.where(INDEX_FILE))
+            return open_plain(self.root / name, self.where(name))
         except FileNotFoundError:
-            raise MissingFileError(f"{self.where(INDEX_FILE)}: no such file") from None
+            raise MissingFileError(f"{self.where(name)}: no such file") from None
         except OSError as error:
-            raise UserError(f"{self.where(INDEX_FILE)}: cannot be read ({error})") from None
+            raise UserError(f"{self.where(name)}: cannot be read ({error})") from None
 
     def open_shard(self, shard: ShardInfo) -> int:
         """A descriptor of a shard, to be closed by the caller. A pipe is not waited for."""
@@ -123,6 +123,16 @@ class LocalStore:
         """Store a file of this machine, whose sha256 is given, under a name."""
         with path.open("rb") as file, atomic_file(self.root / name) as into:
             shutil.copyfileobj(file, into)
+
+    def get(self, name: str, path: Path) -> None:
+        """Fetch a stored file to a path of this machine, where it appears whole."""
+        with self.open_index("", name) as file, atomic_file(path) as into:
+            shutil.copyfileobj(file, into)
+
+    def names(self, folder: str) -> list[str]:
+        """Names of all files stored below a folder, sorted."""
+        below = sorted(path for path in (self.root / folder).rglob("*") if path.is_file())
+        return [path.relative_to(self.root).as_posix() for path in below]
 
     def remove(self, name: str) -> None:
         """Delete a stored file."""
@@ -151,9 +161,9 @@ class RemoteStore:
         self.cache.get(name, len(raw), lambda path: path.write_bytes(raw)).close()
         return raw
 
-    def open_index(self, digest: str) -> BinaryIO:
+    def open_index(self, digest: str, name: str = INDEX_FILE) -> BinaryIO:
         """Open `index.npz`, cached under the manifest's checksum, which decides its content."""
-        url = self.where(INDEX_FILE)
+        url = self.where(name)
 
         def fetch(path: Path) -> None:
             persist(url, lambda: self.system().get_file(url, str(path)))
@@ -207,6 +217,21 @@ class RemoteStore:
         except MissingFileError:
             raise UserError(f"{self.place}: no such bucket or repository; make it first") from None
 
+    def get(self, name: str, path: Path) -> None:
+        where = self.where(name)
+        with atomic_path(path) as whole:
+            persist(where, lambda: self.system().get_file(where, str(whole)))
+
+    def names(self, folder: str) -> list[str]:
+        where = self.where(folder).rstrip("/")
+        try:
+            found = persist(where, lambda: self.system().find(where), first=True)
+        except MissingFileError:
+            return []
+        start = len(self.system()._strip_protocol(self.place).rstrip("/")) + 1
+        # A bucket may have any key: none leads out of the folder that it is fetched into.
+        return sorted(name[start:] for name in found if ".." not in name.split("/"))
+
     def remove(self, name: str) -> None:
         where = self.where(name)
         persist(where, lambda: self.system().rm_file(where))
@@ -223,8 +248,8 @@ class RemoteStore:
 
     def system(self) -> Any:
         """The fsspec file system that `where` names files of."""
-        settings = tuple(sorted(item for item in os.environ.items() if item[0].startswith(("AWS_", "HF_"))))
-        return _connect(cast(str, _scheme(self.place)), os.getpid(), settings)
+        settings = tuple(sorted(item for item in os.environ.items() if item[0].startswith(_SETTINGS)))
+        return connect(cast(str, _scheme(self.place)), os.getpid(), settings)
 
 
 def _object(system: Any, where: str) -> dict[str, str]:
@@ -237,38 +262,18 @@ Store = LocalStore | RemoteStore
 """The files of one data set, by name."""
 
 
-@lru_cache(maxsize=4)
-def _connect(scheme: str, pid: int, settings: tuple[tuple[str, str], ...]) -> Any:
-    """An fsspec file system of this process and environment, without retries of its own (see `persist`)."""
-    try:
-        import fsspec
+def read_stored(store: Store, name: str) -> bytes:
+    """Content of a small stored file; `MissingFileError` if there is none."""
+    with temporary_folder() as folder:
+        store.get(name, folder / "file")
+        return read_plain(folder / "file", name=store.where(name))
 
-        if scheme == "s3":
-            import s3fs  # type: ignore[import-untyped]  # noqa: F401 (a missing one is reported by name)
 
-            system = fsspec.filesystem(
-                "s3",
-                skip_instance_cache=True,
-                use_listings_cache=False,
-                config_kwargs={
-                    "connect_timeout": _CONNECT_SECONDS,
-                    "read_timeout": _READ_SECONDS,
-                    "retries": {"total_max_attempts": 1},
-                    "max_pool_connections": 32,
-                },
-            )
-            system.retries = 1
-            return system
-        if scheme == "hf":  # its own repetitions stay: it knows for how long the hub asks to wait
-            return fsspec.filesystem("hf", skip_instance_cache=True)
-        import aiohttp
-
-        timeout = aiohttp.ClientTimeout(total=None, connect=_CONNECT_SECONDS, sock_read=_READ_SECONDS)
-        return fsspec.filesystem("http", skip_instance_cache=True, client_kwargs={"timeout": timeout})
-    except ImportError as error:
-        raise UserError(
-            f"reading from {scheme}: needs {error.name}; pip install 'motionloom[remote]'"
-        ) from None
+def write_stored(store: Store, name: str, record: object) -> None:
+    """Store a record as JSON."""
+    with temporary_folder() as folder:
+        write_json(folder / "file", record)
+        store.put(folder / "file", name, sha256_of(folder / "file"))
 
 
 def _as_before(raw: bytes, digest: str | None, where: str) -> bytes:
@@ -282,7 +287,8 @@ FIRST_PAUSE, LONGEST_PAUSE = 0.2, 15.0
 """Seconds between tries: doubled each time, at random between half and whole."""
 
 _LIBRARIES = {
-    "aiohttp", "aiobotocore", "botocore", "fsspec", "httpx", "httpx2", "huggingface_hub", "s3fs", "urllib3",
+    "adlfs", "aiohttp", "aiobotocore", "azure", "botocore", "fsspec", "gcsfs", "google", "httpx", "httpx2",
+    "huggingface_hub", "s3fs", "urllib3",
 }  # fmt: skip
 _ABSENT = "no such file on the server"
 
@@ -368,7 +374,8 @@ def _nobody_listens(error: BaseException | None) -> bool:
 def _status(error: BaseException | None) -> int | None:
     """HTTP status behind an error or one of its causes."""
     while error is not None:
-        status = getattr(error, "status", None)
+        own = "code" if type(error).__module__.startswith("gcsfs") else "status_code"
+        status = getattr(error, "status", None) or getattr(error, own, None)
         response = getattr(error, "response", None)
         if isinstance(response, dict):
             status = response.get("ResponseMetadata", {}).get("HTTPStatusCode", status)

@@ -35,8 +35,12 @@ class TarClip:
     members: dict[str, tuple[int, int]] = field(default_factory=dict)
 
 
-def scan_tar(path: Path, *, most: int = MOST_CLIPS) -> list[TarClip]:
-    """Return the clips of a shard in order, at most `most`; a `UserError` names the fault."""
+def scan_tar(path: Path, *, most: int = MOST_CLIPS, column: str = "") -> list[TarClip]:
+    """Return the clips of a shard in order, at most `most`; a `UserError` names the fault.
+
+    Each has a motion and its `meta.json`, or the one member of a `column`.
+    """
+    needed = {column} if column else {"motion.npy", "meta.json"}
     clips: list[TarClip] = []
     seen: set[str] = set()
     size = require_plain(path)
@@ -47,14 +51,14 @@ def scan_tar(path: Path, *, most: int = MOST_CLIPS) -> list[TarClip]:
         for info in _entries(path, file):
             # Contents fill whole blocks; behind the last one nothing but zeros may follow (`_check_end`).
             end = info.offset_data + -(-info.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
-            key, member = _checked_name(path, info)
+            key, member = _checked_name(path, info, column)
             if info.offset_data + info.size > size:
                 last = f"the last whole key is '{clips[-1].key}'" if clips else "no key is whole"
                 raise UserError(f"{path}: truncated inside {info.name!r}; {last}")
             # A new key ends the clip before it, which must be whole; a key may not come again later.
             if not clips or clips[-1].key != key:
                 if clips:
-                    _require_whole(path, clips)
+                    _require_whole(path, clips, needed)
                 if key in seen:
                     raise UserError(
                         f"{path}: duplicate key {key!r}: it comes again after others, or its members do not "
@@ -68,7 +72,7 @@ def scan_tar(path: Path, *, most: int = MOST_CLIPS) -> list[TarClip]:
                 raise UserError(f"{path}: '{info.name}' appears twice: duplicate member")
             clips[-1].members[member] = (info.offset_data, info.size)
     if clips:
-        _require_whole(path, clips)
+        _require_whole(path, clips, needed)
     _check_end(path, end)
     return clips
 
@@ -88,7 +92,7 @@ def _entries(path: Path, file: BinaryIO) -> Iterator[tarfile.TarInfo]:
         file.seek(at)
 
 
-def _checked_name(path: Path, info: tarfile.TarInfo) -> tuple[str, str]:
+def _checked_name(path: Path, info: tarfile.TarInfo, column: str) -> tuple[str, str]:
     """(key, member) of one entry, refused when it is anything but a plain file with a harmless name."""
     name = info.name
     if name.startswith(".") or {"/", "\\", ":", "\0"} & set(name):
@@ -96,16 +100,17 @@ def _checked_name(path: Path, info: tarfile.TarInfo) -> tuple[str, str]:
     if info.type not in (tarfile.REGTYPE, tarfile.AREGTYPE) or info.size < 0:
         raise UserError(f"{path}: {name!r} is a link, folder or device; shards hold plain files only")
     key, _, member = name.partition(".")
-    if member not in MEMBERS:
+    known = [column] if column else MEMBERS
+    if member not in known:
         discover()  # a worker may not have met the modalities of other packages
-    if member not in MEMBERS:
-        raise UserError(f"{path}: {name!r} is not a known member; known: {', '.join(MEMBERS)}")
+    if member not in known:
+        raise UserError(f"{path}: {name!r} is not a known member; known: {', '.join(known)}")
     return key, member
 
 
-def _require_whole(path: Path, clips: list[TarClip]) -> None:
+def _require_whole(path: Path, clips: list[TarClip], needed: set[str]) -> None:
     clip = clips[-1]
-    missing = {"motion.npy", "meta.json"} - clip.members.keys()
+    missing = needed - clip.members.keys()
     if missing:
         last = f" (truncated? the last whole key is '{clips[-2].key}')" if len(clips) > 1 else ""
         raise UserError(f"{path}: missing field: key '{clip.key}' has no {sorted(missing)[0]}{last}")

@@ -26,6 +26,7 @@ from motionloom.datasets.shards.index import ClipEntry, ShardIndex, Written, cli
 from motionloom.datasets.shards.left_out import drop
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import DropClip, Sample, encode_sample
+from motionloom.datasets.shards.store import RemoteStore
 
 T = TypeVar("T")
 Convert = Callable[[T], Sample | list[Sample]]
@@ -255,14 +256,24 @@ def _convert_item(task: ShardTask[T], convert: Convert[T], item: ShardItem[T]) -
         return failed
 
 
-def finished_shard(tar: Path, fingerprint: str, *, strict: bool = False) -> Result | None:
-    """Return an earlier run's result of a task from the same inputs, or None when it must be made."""
+def finished_shard(
+    tar: Path, fingerprint: str, store: RemoteStore | None = None, *, strict: bool = False
+) -> Result | None:
+    """Return an earlier run's result of a task from the same inputs, or None when it must be made.
+
+    The shard is in the folder of `tar`, or in the bucket that this stands for.
+    """
     try:
+        if store is not None and not index_path(tar).exists():
+            store.get(index_path(tar).name, index_path(tar))
         index = ShardIndex.load_json(index_path(tar))
         if index.fingerprint != fingerprint or (strict and any(index.dropped)):
             return None
         if index.shard is not None:
-            require_intact(LocalShard(tar, index.shard))
+            if store is None:
+                require_intact(LocalShard(tar, index.shard))
+            elif store.digest(tar.name) != index.shard.sha256:
+                return None
     except UserError:  # none, or damaged: made again
         return None
     return index.shard, index.dropped

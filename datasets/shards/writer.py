@@ -41,6 +41,8 @@ from motionloom.datasets.shards.finish import (
 )
 from motionloom.datasets.shards.index import ShardIndex, index_path
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
+from motionloom.datasets.shards.staging import put
+from motionloom.datasets.shards.store import RemoteStore
 from motionloom.datasets.shards.tar import MOST_CLIPS
 from motionloom.datasets.shards.tasks import (
     Convert,
@@ -85,8 +87,11 @@ def dataset_writer(
     describe: Callable[[T], str] = str,
     depends_on: Callable[[T], object] | None = None,
     removed: Sequence[tuple[Split, T]] = (),
+    store: RemoteStore | None = None,
 ) -> Iterator[DatasetWriter[T]]:
     """Context that locks `out` and compares it with the plan, for work between that and the writing.
+
+    `store` is the bucket that the folder stands for (`staging.py`); then a part is written.
 
     `describe` names an item in reports and in the digest by which an earlier run's clips are kept, so it must
     not change between runs. `depends_on` returns the item's content as plain JSON; without it only names and
@@ -98,16 +103,23 @@ def dataset_writer(
     out.mkdir(parents=True, exist_ok=True)
     with folder_lock(out, shared=how.part is not None), Workers(how.workers) as pool:
         tasks = plan_shards(out, items, facts, how, describe, depends_on, removed)
-        yield DatasetWriter(out, tasks, facts, how, pool)
+        yield DatasetWriter(out, tasks, facts, how, pool, store)
 
 
 class DatasetWriter(Generic[T]):
     """The shards of one run, planned and compared with what an earlier run finished."""
 
     def __init__(
-        self, out: Path, tasks: list[ShardTask[T]], facts: DatasetFacts, how: WriteOptions, pool: Workers
+        self,
+        out: Path,
+        tasks: list[ShardTask[T]],
+        facts: DatasetFacts,
+        how: WriteOptions,
+        pool: Workers,
+        store: RemoteStore | None,
     ) -> None:
         self.out = out
+        self._store = store
         self._pool = pool
         self._how = how
         self._name = facts.name
@@ -116,10 +128,12 @@ class DatasetWriter(Generic[T]):
         part = how.part
         self._tasks = tasks if part is None else [task for at, task in enumerate(tasks) if part.has(at)]
         with ThreadPoolExecutor(pool.count) as threads:  # hashing runs outside the interpreter's lock
-            self._results = list(threads.map(_finished, self._tasks))
+            self._results = list(threads.map(self._finished, self._tasks))
         self._todo = [at for at, result in enumerate(self._results) if result is None]
         self._news = ""
         if self._todo:
+            if store is not None and (out / MANIFEST_FILE).exists():
+                store.remove(MANIFEST_FILE)
             for folder in (out, out / OLD_FOLDER):  # a removal that was killed has no say any more
                 (folder / MANIFEST_FILE).unlink(missing_ok=True)
             if part is None:
@@ -188,8 +202,16 @@ class DatasetWriter(Generic[T]):
         part = self._how.part
         if part is None:
             return finish(self.out, self._planned, self._shards(convert))
-        write_record(self.out, part, self._planned)
-        return self._planned.with_results(self._shards(convert))
+        if self._store is None:
+            write_record(self.out, part, self._planned)
+        manifest = self._planned.with_results(self._shards(convert))
+        if self._store is not None:
+            record = write_record(self.out, part, self._planned)
+            put(self._store, self.out, *_names(self.out, "joint_maps/*"), record)
+        return manifest
+
+    def _finished(self, task: ShardTask[T]) -> Result | None:
+        return finished_shard(task.path, task.fingerprint, self._store, strict=task.strict)
 
     def _shards(self, convert: Convert[T]) -> list[Result]:
         done = len(self._tasks) - len(self._todo)
@@ -197,6 +219,10 @@ class DatasetWriter(Generic[T]):
             tasks = [self._tasks[at] for at in self._todo]
             for position, result in self._pool.run(partial(write_shard, convert=convert), tasks):
                 self._results[self._todo[position]] = result
+                if self._store is not None:  # the index behind its shard, which then leaves this disk
+                    path = tasks[position].path
+                    put(self._store, self.out, path.name, index_path(path).name)
+                    path.unlink(missing_ok=True)
                 meter.advance()
         return [result for result in self._results if result is not None]
 
@@ -230,8 +256,8 @@ def _planned(tasks: Sequence[ShardTask[T]], facts: DatasetFacts) -> Planned:
     )
 
 
-def _finished(task: ShardTask[T]) -> Result | None:
-    return finished_shard(task.path, task.fingerprint, strict=task.strict)
+def _names(folder: Path, pattern: str) -> list[str]:
+    return sorted(path.relative_to(folder).as_posix() for path in folder.glob(pattern))
 
 
 def _check_arguments(facts: DatasetFacts, how: WriteOptions) -> None:

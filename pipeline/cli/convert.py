@@ -28,8 +28,11 @@ from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError, nearest
 from motionloom.datasets.base.records import MANIFEST_FILE, Manifest
 from motionloom.datasets.convert.registry import converter_named, names
+from motionloom.datasets.shards.finish import join_parts
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, tally
 from motionloom.datasets.shards.options import Part
+from motionloom.datasets.shards.staging import staged
+from motionloom.datasets.shards.store import RemoteStore
 from motionloom.pipeline.cli.options import Commands, Workers, fields_of, set_option
 from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.store.files import require_folder
@@ -88,17 +91,23 @@ def _command(name: str) -> Any:
     config = entry.config_class
     docs = field_docs(config)
 
-    def run(source: Path, out: Path, plan: bool, part: str | None, workers: int, sets: list[str] | None,
+    def run(source: Path, out: str, plan: bool, part: str | None, workers: int, sets: list[str] | None,
             **everyday: Any) -> None:  # fmt: skip
         settings = {key: value for key, value in everyday.items() if value is not None}
         settings |= fields_of(sets, "--set")
         fields = {**settings, "source": source}
         share = None if part is None else Part.parse(part)
-        convert_command(name, fields, out, plan=plan, part=share, workers=workers, console=make_console())
+        how: dict[str, Any] = {"plan": plan, "workers": workers, "console": make_console()}
+        with staged(out) as (folder, store):
+            if store is not None and not plan:
+                share = share or Part(1, 1)
+            convert_command(name, fields, folder, part=share, store=store, place=out, **how)
+        if store is not None and not plan and part is None:
+            say_manifest(join_parts(out), out, how["console"])
 
     parameters = [
         _parameter("source", Annotated[Path, typer.Argument(help=_help(config, "source", docs))]),
-        _parameter("out", Annotated[Path, typer.Argument(help="Folder for the shards.")]),
+        _parameter("out", Annotated[str, typer.Argument(help="Folder for the shards, or s3://BUCKET/SET.")]),
     ]
     for key in config.everyday:
         option = typer.Option(_flag(key), help=_help(config, key, docs))
@@ -112,7 +121,8 @@ def _command(name: str) -> Any:
     run.__doc__ = (
         f"{entry.summary}\n\nExample: `motionloom data convert {name} {entry.example} --plan`\n\n"
         f"In eight parts: `motionloom data convert {name} … --part 1/8` to `--part 8/8`, in any order on "
-        f"machines that see both folders; then `motionloom data join {entry.example.split()[1]}`\n\n"
+        f"machines that see both folders, or one bucket; then "
+        f"`motionloom data join {entry.example.split()[1]}`\n\n"
         f"Settings for `--set KEY=VALUE`:\n\n{listed}"
     )
     app = Commands(add_completion=False, rich_markup_mode="markdown")
@@ -192,8 +202,10 @@ def convert_command(
     part: Part | None = None,
     workers: int,
     console: Console,
+    store: RemoteStore | None = None,
+    place: str = "",
 ) -> None:
-    """Plan a conversion, or run it."""
+    """Plan a conversion, or run it; `out` may stand for the bucket `store` at `place`."""
     from motionloom.datasets.convert.common.conversion import run_conversion
     from motionloom.datasets.convert.registry import converter_named, prepare
 
@@ -204,7 +216,7 @@ def convert_command(
         conversion = prepare(config, kind=converter, out=out, workers=workers, progress=shown).looked()
         planned = conversion.plan
         licensed = bool(conversion.converter.licence(planned))
-        line = proposed(kind, config, out, planned, licensed=licensed) if planned.items else ""
+        line = proposed(kind, config, place or out, planned, licensed=licensed) if planned.items else ""
         line += f" --part {part}" if part and line else ""
         _say_plan(planned, console)
         if conversion.moved:
@@ -221,14 +233,15 @@ def convert_command(
     for note in conversion.plan.notes:
         say(console, f"note: {note}")
     manifest = run_conversion(
-        conversion, out, workers=workers, progress=shown, part=part, say=lambda line: say(console, line)
-    )
+        conversion, out, workers=workers, progress=shown, part=part, store=store,
+        say=lambda line: say(console, line.replace(str(out), place or str(out))),
+    )  # fmt: skip
     if part is not None:
         clips = sum(shard.samples for shard in manifest.shards)
         say(
             console,
             f"part {part} is made: {len(manifest.shards):,} shards, {clips:,} clips; when all parts are: "
-            f"{shlex.join(['motionloom', 'data', 'join', str(out)])}",
+            f"{shlex.join(['motionloom', 'data', 'join', place or str(out)])}",
         )
         return
     say_manifest(manifest, out, console)
@@ -238,7 +251,7 @@ def convert_command(
 
 
 def proposed(
-    kind: str, config: ConvertConfig, out: Path, plan: ConversionPlan[Any], *, licensed: bool
+    kind: str, config: ConvertConfig, out: Path | str, plan: ConversionPlan[Any], *, licensed: bool
 ) -> str:
     """The command that converts what was planned: the settings given, and what else the plan found needed."""
     # Whatever would stop the conversion is decided here in the careful way, for the user to see and change.
@@ -275,7 +288,7 @@ def _say_plan(plan: ConversionPlan[Any], console: Console) -> None:
         say(console, line)
 
 
-def say_manifest(manifest: Manifest, out: Path, console: Console) -> None:
+def say_manifest(manifest: Manifest, out: Path | str, console: Console) -> None:
     """Print the counts per split, what was dropped, and where the manifest is."""
     table = Table("split", "shards", "clips", "minutes", "MiB")
     for split in ("train", "val", "test"):
@@ -290,17 +303,17 @@ def say_manifest(manifest: Manifest, out: Path, console: Console) -> None:
     _say_left_out(manifest, out, console)
     say(
         console,
-        f"{out / 'manifest.json'}: layout {manifest.layout} ({manifest.family}), "
+        f"{out}/{MANIFEST_FILE}: layout {manifest.layout} ({manifest.family}), "
         f"{manifest.fps:g} fps, {', '.join(manifest.licences) or manifest.licence}",
     )
 
 
-def _say_left_out(manifest: Manifest, out: Path, console: Console) -> None:
+def _say_left_out(manifest: Manifest, out: Path | str, console: Console) -> None:
     """Print how much was left out, a line for each reason, and where the whole list is."""
     if not manifest.dropped:
         return
-    listed = out / LEFT_OUT_FILE
-    place = listed if listed.exists() else out / MANIFEST_FILE
+    is_listed = isinstance(out, str) or (out / LEFT_OUT_FILE).exists()
+    place = f"{out}/{LEFT_OUT_FILE if is_listed else MANIFEST_FILE}"
     console.print(f"left out: {tally(manifest.dropped)}; all in {place}", markup=False, soft_wrap=True)
     groups = grouped(manifest.dropped)
     for group in groups[:_REASONS]:

@@ -60,7 +60,7 @@ def synth(
 
 
 @data_app.command()
-def join(out: Annotated[Path, typer.Argument(help="Folder with the shards of all parts.")]) -> None:
+def join(out: Annotated[str, typer.Argument(help="Folder or bucket with the shards of all parts.")]) -> None:
     """One data set of the parts that `data convert --part` made; one that is missing is named.
 
     Example: `motionloom data join shards`

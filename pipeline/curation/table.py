@@ -6,4 +6,11 @@ from motionloom.datasets.base.register import declare
 
 _HERE = "motionloom.pipeline.curation"
 
-declare("command", {"search": f"{_HERE}.search_command", "data clean": f"{_HERE}.clean_command"})
+declare(
+    "command",
+    {
+        "search": f"{_HERE}.search_command",
+        "data add": f"{_HERE}.add_command",
+        "data clean": f"{_HERE}.clean_command",
+    },
+)

@@ -126,7 +126,7 @@ class Data:
             LocalShard(store.root / shard.name, shard)
             for store, manifest in self._sources()
             if isinstance(store, LocalStore)
-            for shard in manifest.shards
+            for shard in manifest.tars
         ]
 
     def terms(self) -> Terms:

@@ -108,3 +108,8 @@ def write(out: Path, count: int = 60, convert: Convert | None = None, **changes:
     how = WriteOptions(**{"clips_per_shard": 8, "progress": False, **changes})
     given = facts(**{"options": {"size": count}, **about})
     return write_dataset(out, items(count), convert or Convert(), given, how)
+
+
+def joined(clip: dict[str, Any], column: dict[str, Any]) -> Any:
+    """A clip with what a column holds for it, as Megatron-Energon joins two data sets."""
+    return type(clip)({**clip, **column})

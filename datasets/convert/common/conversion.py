@@ -24,6 +24,7 @@ from motionloom.datasets.shards.index import load_index
 from motionloom.datasets.shards.left_out import grouped_notes
 from motionloom.datasets.shards.options import SOURCE_CHECKSUM, DatasetFacts, Part, WriteOptions
 from motionloom.datasets.shards.reader import load_manifest
+from motionloom.datasets.shards.store import RemoteStore
 from motionloom.datasets.shards.tasks import plan_shards
 from motionloom.datasets.shards.writer import dataset_writer
 
@@ -116,13 +117,15 @@ def run_conversion(
     clips_per_shard: int = WriteOptions.clips_per_shard,
     progress: bool = True,
     part: Part | None = None,
+    store: RemoteStore | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> Manifest:
     """Write the shards, or those of `part` alone, of which `join_parts` makes one data set.
 
     Before the first clip a few are looked at (`config.look`), in each part the same of the whole source.
     `say` gets what an earlier run has finished, and what the look found odd. Same input and options give the
-    same bytes for any `workers` and parts; a killed run goes on at the first unfinished shard.
+    same bytes for any `workers` and parts; a killed run goes on at the first unfinished shard. `store` is the
+    bucket that `out` stands for.
     """
     how = WriteOptions(workers, clips_per_shard, seed, progress=progress, part=part)
     plan = conversion.plan
@@ -131,8 +134,9 @@ def run_conversion(
         raise UserError(f"{plan.name}: say under which licence the clips are: --set licence=CC-BY-4.0")
     depends_on = conversion.converter.depends_on
     with dataset_writer(
-        out, plan.items, conversion.facts(), how, describe=_label, depends_on=depends_on, removed=plan.removed
-    ) as writer:
+        out, plan.items, conversion.facts(), how, describe=_label, depends_on=depends_on,
+        removed=plan.removed, store=store,
+    ) as writer:  # fmt: skip
         for line in filter(None, (writer.progress_line, conversion.moved)):
             say(line)
         if writer.pending():

@@ -27,6 +27,7 @@ from motionloom.datasets.shards.copy import copy_dataset
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.store import open_store
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
+from motionloom.pipeline.curation.add_command import add
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +60,8 @@ def with_datasets(folder: Path, split: str) -> Iterator[dict[str, Any]]:
     read = datasets.load_dataset(
         "webdataset", data_files={split: tars(folder, split)}, split=split, cache_dir=folder / "hf"
     )
-    yield from read.with_format("numpy", columns=["motion.npy"], output_all_columns=True)
+    arrays = [name for name in read.column_names if name == "motion.npy"]  # a column's tar has none
+    yield from read.with_format("numpy", columns=arrays, output_all_columns=True)
 
 
 def with_folder(folder: Path, split: str) -> Iterator[dict[str, Any]]:
@@ -76,7 +78,9 @@ def with_energon(folder: Path, split: str) -> Iterator[dict[str, Any]]:
     for name in SPLITS:
         command += ["--split-parts", f"{name}:.*-{name}-.*"]
     command += ["--no-progress", "--num-workers", "1", "--sample-type", "CrudeWebdataset"]
-    done = subprocess.run([*command, "--force-overwrite"], capture_output=True, text=True)
+    done = subprocess.run(
+        [*command, "--force-overwrite", "--exclude", "^columns/"], capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stdout
 
     @energon.edataclass
@@ -142,6 +146,47 @@ def test_no_field_is_null(sets: Path) -> None:
     for sample in with_webdataset(sets, "train"):
         for record in (sample["meta.json"], *sample["texts.json"]):
             assert None not in record.values() and not {list, dict} & {type(v) for v in record.values()}
+
+
+def test_a_column_is_read_with_its_clips(sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Zipped by `webdataset`, joined by `datasets` and Megatron-Energon: tars of the same keys and order."""
+    data = Path(shutil.copytree(sets / "made", tmp_path / "made"))
+    ours = ShardDataset.open(data, "val")
+    lines = [json.dumps({"id": name, "captions": [f"more of {name}"]}) for name in ours.ids[1:]]
+    (tmp_path / "more.jsonl").write_text("\n".join(lines))
+    add(str(data), tmp_path / "more.jsonl")
+    side = data / "columns" / "more"
+    wanted = {name: [f"more of {name}"] * (i > 0) for i, name in enumerate(ours.ids)}
+    pairs = zip(with_webdataset(sets / "made", "val"), with_webdataset(side, "val"), strict=True)
+    read = [{**clip, **column} for clip, column in pairs if clip["__key__"] == column["__key__"]]
+    clips, columns = ([*with_folder(data, "val")], [*with_datasets(side, "val")])
+    assert [one["__key__"] for one in clips] == [one["__key__"] for one in columns]
+    read += [{**clip, "more.json": column["more.json"]} for clip, column in zip(clips, columns, strict=True)]
+    energon = pytest.importorskip("megatron.energon")
+    for folder in (side, data):
+        assert next(with_energon(folder, "val"))
+    joined = {"__module__": "shard_samples", "__function__": "joined"}
+    parts = [{"path": str(folder), "split_part": "val"} for folder in (data, side)]
+    recipe = {"__module__": "megatron.energon", "__class__": "MetadatasetV2"}
+    config = tmp_path / "join.yaml"
+    config.write_text(json.dumps({**recipe, "splits": {"val": {"join": parts, "joiner": joined}}}))
+    helpers = str(Path(__file__).parents[2] / "helpers")
+    command = [Path(sys.executable).with_name("energon"), "prepare", config]
+    subprocess.run(command, check=True, env={**os.environ, "PYTHONPATH": helpers})
+    worker = energon.WorkerConfig(rank=0, world_size=1, num_workers=0)
+
+    class Encoder(energon.DefaultTaskEncoder):  # type: ignore[name-defined, misc]
+        @energon.stateless
+        def batch(self, samples: list[Any]) -> list[Any]:
+            return samples
+
+    both = energon.get_val_dataset(
+        config, split_part="val", batch_size=1, task_encoder=Encoder(), worker_config=worker
+    )
+    read += [clip for (clip,) in energon.get_loader(both)]
+    assert len(read) == 3 * len(ours)
+    for clip in read:
+        assert [one["text"] for one in clip["more.json"] or []] == wanted[clip["meta.json"]["id"]]
 
 
 def test_shards_of_another_release_are_refused(made: ModuleType, tmp_path: Path) -> None:
@@ -306,7 +351,7 @@ def test_a_data_set_of_the_hub(
     made: ModuleType, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Hub, "root", str(tmp_path / "hub"))
-    monkeypatch.setattr(store, "_connect", lambda *_: Hub(auto_mkdir=True, skip_instance_cache=True))
+    monkeypatch.setattr(store, "connect", lambda *_: Hub(auto_mkdir=True, skip_instance_cache=True))
     remove(data, ids=ShardDataset.open(data, "test").ids[:1])
     place = "hf://datasets/owner/name"
     told = {name: content for name, content in files(data).items() if name != "removed.json"}

@@ -48,7 +48,7 @@ def same(one: ShardDataset, other: ShardDataset) -> None:
             assert np.array_equal(a, b)
 
 
-OTHER_SCHEMES = ("gs://bucket/'x y'", "ssh://host/x", "python:x", "memory://x")
+OTHER_SCHEMES = ("ftp://host/'x y'", "ssh://host/x", "python:x", "memory://x")
 
 
 @pytest.mark.parametrize(
@@ -59,7 +59,7 @@ def test_other_schemes_are_refused_before_anything_opens(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "fsspec", None)
-    with pytest.raises(UserError, match=r"file:, http:, https:, s3:, hf:"):
+    with pytest.raises(UserError, match=r"file:, http:, https:, s3:, gs:, az:, hf:"):
         ShardDataset.open(place, "train")
     assert not list(tmp_path.iterdir())
 
