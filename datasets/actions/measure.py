@@ -114,7 +114,9 @@ def find_mismatch(requests: Sequence[Record], joints: NDArray[np.floating], fps:
         return f"it lasts {len(joints) / fps:.1f} s, not {asked['seconds']}"
     for side, name in enumerate(SIDES):
         meant = asked.get(f"{name}_hand")
-        shape = hand_shape(joints, side, fps) if meant and joints.shape[1] >= 52 else meant
+        if not meant or joints.shape[1] < 52:
+            continue
+        shape = hand_shape(joints, side, fps)
         if shape != meant:
             return f"the {name} hand is {_SHAPES.get(shape, shape)}, not {_SHAPES[meant]}"
     if len(actions_of(asked)) > 1:

@@ -139,7 +139,8 @@ class Search:
         if not text.strip():
             raise UserError("search: no words; say what the person does")
         self._require_known()
-        return _embed_texts(self.tma, [text])[0]
+        found: Vectors = _embed_texts(self.tma, [text])[0]
+        return found
 
     def _require_known(self) -> None:
         if self.precision < LEAST_PRECISION:

@@ -26,7 +26,6 @@ from motionloom.pipeline.launch.process import beside, process_rank, take_place
 from motionloom.pipeline.launch.team import Team
 from motionloom.pipeline.runs.dry_run import explain_replacements, plan_table, replaced_stages, say_estimate
 from motionloom.pipeline.runs.execute import context_of, execute, facts_of, perform
-from motionloom.pipeline.runs.mirror import Mirror
 from motionloom.pipeline.runs.plan import Selection, doubts, make_plan, require_fit, selected
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.runs.snapshot import run_at
@@ -72,8 +71,11 @@ def run_recipe(
     chosen = selected(loaded, select or Selection())
     if mirror is not None and loaded.hardware.nodes > 1:
         raise UserError("--mirror serves one machine, and hardware.nodes is more: give them a shared folder")
-    copies = None if mirror is None or dry_run else Mirror(mirror, run, console)
-    if copies is not None:
+    copies = None
+    if mirror is not None and not dry_run:
+        from motionloom.pipeline.runs.mirror import Mirror
+
+        copies = Mirror(mirror, run, console)
         copies.fetch(sorted(chosen))
     try:
         plan = make_plan(loaded, run, select, go_on)
