@@ -23,7 +23,9 @@ from motionloom.pipeline.evaluation.truth import truth_of
 from motionloom.pipeline.runs.recipe import load_recipe
 
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
-SCRIPTS = [path for path in sorted(FOLDER.glob("*.py")) if path.name not in ("bench.py", "charted.py")]
+SCRIPTS = [
+    path for path in sorted(FOLDER.glob("*.py")) if path.name not in ("bench.py", "charted.py", "rows.py")
+]
 SCRIPTS.append(FOLDER.parent / "docs" / "pictures.py")
 
 

@@ -46,5 +46,6 @@ def test_500_damaged_inputs_of_each_reader_end_in_a_sentence(
     wrong = {name: one.places for name, one in counts.items() if one.places}
     assert not wrong, f"{wrong}; their inputs are in {tmp_path / 'failing'}"
     assert all(
-        one.inputs == 500 and one.refused > 0 for name, one in counts.items() if name != "search vectors"
-    )
+        one.inputs == 500 and (one.refused > 0 or name in ("search vectors", "note of sources"))
+        for name, one in counts.items()
+    )  # what these two remember is made anew where it is damaged

@@ -251,7 +251,7 @@ def test_the_readme_says_what_the_models_of_the_package_know() -> None:
 PAGES = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "models/pretrained").glob("*/*.md")]
 SOURCES = [path for room in ("datasets", "models", "pipeline") for path in (ROOT / room).rglob("*.py")]
 OF_SLURM = "cpus-per-task dependency gpus-per-node gpus-per-task jobs kill-on-bad-exit kill-on-invalid-dep"
-OF_MORE = "max-restarts rdzv-backend filename yes"
+OF_MORE = "exclude max-restarts rdzv-backend filename yes"
 OTHERS = (
     f"{OF_SLURM} {OF_MORE} nodes noheader ntasks-per-node parsable requeue extra-index-url torch-backend help"
 )

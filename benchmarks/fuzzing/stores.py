@@ -15,6 +15,7 @@ from fuzzing.mutations import damaged_json, damaged_yaml
 from fuzzing.sealed import damaged_tar, damaged_zip
 from fuzzing.table import Read, Seed, of_files, of_tree, reader
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.memory import content_of, recall, remembering
 from motionloom.datasets.base.records import Column, Decisions
 from motionloom.datasets.check.dataset import examine
 from motionloom.datasets.convert.common.removed import Removed
@@ -129,6 +130,20 @@ def _data_set(folder: Path) -> Made:
         "removed.json": damaged_json,
     }
     return of_tree(root, damages, read)
+
+
+@reader("note of sources", "base/memory.py")
+def _note(folder: Path) -> Made:
+    source = folder / "walk.txt"
+    source.write_text("a person walks")
+
+    def read(note: Path) -> object:
+        with remembering(note):
+            return recall("text", source, source.read_text), content_of(source)
+
+    read(folder / ".sources.json")
+    content = (folder / ".sources.json").read_bytes()
+    return of_files(folder, ".sources.json", [content], damaged_json, read)
 
 
 @reader("part of a conversion", "shards/finish.py", "shards/tasks.py", "shards/writer.py")

@@ -108,7 +108,7 @@ def test_one_part_reads_the_source_for_all(shared: Path, tmp_path: Path) -> None
         opened.clear()
         planned = prepare(config, kind=kind, out=tmp_path / out, write=True)
         manifest = run_conversion(planned, tmp_path / out, progress=False, clips_per_shard=2, part=part)
-        indices = [tmp_path / out / shard.name.replace(".tar", ".index.json") for shard in manifest.shards]
+        indices = [tmp_path / out / shard.name.replace(".tar", ".index") for shard in manifest.shards]
         own = {
             Path(clip["source"]).stem for path in indices for clip in json.loads(path.read_text())["clips"]
         }
