@@ -39,10 +39,13 @@ def test_commands_of_a_page_run_as_typed(
         (Path(folder) / "map.json").unlink()
     lines = [f'{{"id": "{name}", "captions": ["a person walks"]}}\n' for name in names]
     Path("mocap/captions.jsonl").write_text("".join(lines))
+    Path("captions.jsonl").write_text('{"id": "synth-0-000003", "captions": ["somebody moves"]}\n')
     for name in names:
         Path(f"cmu-texts/{name}.txt").write_text("a person walks\n")
     before: list[str] = []
     for words in typed(page):
+        if any("s3://my-bucket" in word for word in words):
+            continue  # tried with a bucket by test_staging.py and test_store.py
         if words[:2] == ["data", "join"]:  # all parts before, of which the page types one
             for part in range(1, 9):
                 assert call(*before[:-1], f"{part}/8").code == 0
