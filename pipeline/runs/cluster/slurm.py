@@ -55,13 +55,11 @@ PROGRAM = (sys.executable, "-P", "-m", "motionloom")
 """By this Python, which must lie under the same path on every node."""
 
 _SIGNALS = """\
-child= warned= came= early=
+child= warned= early=
 pass_on() {{  # to the command: a training saves the step it is at, and ends
-  came=1
   if [ -n "$child" ]; then kill -s "$1" "$child" 2> /dev/null || true; else early=$1; fi
 }}
 warn() {{
-  came=1
   [ "${{SLURM_RESTART_COUNT:-0}}" -lt {requeues} ] || return 0  # it may still finish
   warned=1
   pass_on USR1
@@ -78,14 +76,12 @@ job would be over, and failed, before SLURM queues it again: the script does so 
 _WAIT = """\
 child=$!
 [ -z "$early" ] || pass_on "$early"
+# Not by `wait`: bash loses the code of what ends while a signal interrupts it. A signal waits for `sleep` instead.
+while kill -0 "$child" 2> /dev/null; do
+  sleep 1
+done
 code=0
 wait "$child" || code=$?
-while [ -n "$came" ]; do  # a signal ended the wait, not the command
-  came=
-  ended=0
-  wait "$child" || ended=$?
-  [ "$ended" -eq 127 ] || code=$ended
-done
 # {saved}: a training is saved. 138: the warning ended a command that has nothing to save.
 # A job that was cancelled is not RUNNING any more; queued again it would come back.
 again=
