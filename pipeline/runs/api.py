@@ -69,13 +69,14 @@ def run_recipe(
         say(console, f"{run}: {count} files have the sha256 that their stages noted")
     dry_run = dry_run or sizes
     chosen = selected(loaded, select or Selection())
-    if mirror is not None and loaded.hardware.nodes > 1:
-        raise UserError("--mirror serves one machine, and hardware.nodes is more: give them a shared folder")
     copies = None
     if mirror is not None and not dry_run:
         from motionloom.pipeline.runs.mirror import Mirror
 
-        copies = Mirror(mirror, run, console)
+        hardware = loaded.hardware
+        # Machines with disks of their own meet before they plan, so that all have what the plan looks at.
+        team = Team.start(hardware) if hardware.nodes > 1 else None
+        copies = Mirror(mirror, run, console, team, hardware.resolved_devices())
         copies.fetch(sorted(chosen))
     try:
         plan = make_plan(loaded, run, select, go_on)
@@ -113,22 +114,17 @@ def run_recipe(
         message = f"{run}: all {len(plan)} stages are finished, nothing to do"
     say(console, message)
     with copies or nullcontext():
-        send = _nowhere if copies is None or process_rank() > 0 else copies.send
         for row in plan:
-            if row.action == "skip":
-                send(row.stage.name)
+            if row.action == "skip" and copies is not None:
+                copies.send(row.stage.name)
         if todo or beside() > 1:  # one that has another recipe may think that nothing is to do
-            execute(loaded, run, plan, console, send)
+            execute(loaded, run, plan, console, copies)
     for row in plan:
         page = stage_folder(run, row.stage.name) / "report.html"
         # Not the page of an earlier run with other settings.
         if "page" in row.stage.kind.gives(row.stage.config) and row.action != "leave" and page.is_file():
             say(console, f"watch it: {page.resolve()}")
     return run
-
-
-def _nowhere(stage: str) -> None:
-    """Send nothing: there is no mirror, or the lead has it."""
 
 
 def _stages_again(

@@ -9,6 +9,7 @@ from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
@@ -36,6 +37,9 @@ from motionloom.pipeline.store.files import remove_tree, write_json
 from motionloom.pipeline.store.run_folder import identity_of, place_from, require_own, stage_folder
 from motionloom.pipeline.store.yaml import flatten
 
+if TYPE_CHECKING:
+    from motionloom.pipeline.runs.mirror import Mirror
+
 LOCKS = ".locks"
 """In the run folder: a lock file for each stage."""
 
@@ -45,17 +49,14 @@ _DRAWING = (sys.executable, "-P", "-m", "motionloom.pipeline.runs.samples")
 
 
 def execute(
-    recipe: Recipe,
-    run: Path,
-    plan: Sequence[PlannedStage],
-    console: Console,
-    send: Callable[[str], None] = lambda stage: None,
+    recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Console, copies: Mirror | None = None
 ) -> list[str]:
     """Run the plan; returns the names of the stages that ran. Safe to kill and start again at any moment.
 
     With several processes each calls this with the same plan: the lead runs and writes everything, the others
-    only take part in trainings and in stages that share their work, and return after the last one. The lead
-    calls `send` with a stage when it has begun, has another checkpoint and is finished.
+    only take part in trainings and in stages that share their work, and return after the last one. A stage is
+    sent to `copies` when it has begun, has another checkpoint and is finished; machines that share no disk
+    have from there what the stages of all of them read.
     """
     todo = [row for row in plan if row.action in {"run", "resume"}]
     if recipe.hardware.part is not None:
@@ -70,7 +71,11 @@ def execute(
         todo = joint  # all other stages run in the lead alone
     with _locks(run, recipe, todo) if leads else nullcontext():
         # All processes start before anything is written, so that they make the same plan.
-        team = Team.start(recipe.hardware, facts_of(recipe, run, plan)) if together else Team()
+        facts = facts_of(recipe, run, plan)
+        if copies is not None:
+            facts["the run folder"] = copies.store.place  # each machine may have its own
+        team = Team.start(recipe.hardware, facts) if together else Team()
+        send: Callable[[str], None] = _nowhere if copies is None else copies.send
         if leads and todo:
             said = doubts(recipe, run, (row.stage for row in todo))
             for doubt in said:
@@ -91,7 +96,9 @@ def execute(
             if leads:
                 send(stage.name)
                 context = replace(context, begun=partial(_note, folder, row), saved=partial(send, stage.name))
-            perform(stage.kind, context, team, run)
+            if copies is not None and row in joint:
+                copies.spread([*_read_by(context, recipe), stage.name])
+            perform(stage.kind, context, team, run, copies)
             if leads:
                 seconds = time.perf_counter() - begin
                 took = {"seconds": round(seconds, 2), "hardware": recipe.hardware.describe()}
@@ -103,6 +110,10 @@ def execute(
         if leads:
             (run / REQUEST_FILE).unlink(missing_ok=True)
     return [row.stage.name for row in todo]
+
+
+def _nowhere(stage: str) -> None:
+    """Send nothing: there is no mirror."""
 
 
 def finish_stage(
@@ -158,7 +169,9 @@ def _execute_part(
     return [row.stage.name for row in todo]
 
 
-def perform(kind: StageKind, context: StageContext, team: Team, run: Path) -> None:
+def perform(
+    kind: StageKind, context: StageContext, team: Team, run: Path, copies: Mirror | None = None
+) -> None:
     """One stage of `run`, by all processes that take part in its kind."""
     if kind.trains:
         verify_shards(context, team, run)
@@ -169,6 +182,8 @@ def perform(kind: StageKind, context: StageContext, team: Team, run: Path) -> No
             verify_shards(context, team, run)
             kind.share(context)
             team.meet()
+            if copies is not None:
+                copies.collect(context.name)
         elif team.leads:
             verify_shards(context, Team(), run)
         if team.leads:
@@ -211,6 +226,12 @@ def draws_motions(recipe: Recipe, stage: Stage) -> bool:
         if GENERATOR in one.kind.gives(one.config) and (one is stage or last):
             return True
     return False
+
+
+def _read_by(context: StageContext, recipe: Recipe) -> list[str]:
+    """Names of the stages of this run that one is made from, sorted."""
+    read = {above.name for source in context.inputs.values() for above in (source, *source.upstream())}
+    return sorted(read - recipe.outside.keys())
 
 
 def stage_inputs(recipe: Recipe, run: Path, stage: Stage) -> dict[str, CompletedStage]:

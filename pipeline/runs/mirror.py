@@ -4,11 +4,14 @@ Every finished stage and each checkpoint is put there in the background. A machi
 by fetching what its stages need, and goes on with the same bytes. A training's folder there is, at any
 moment, of one `started.json`: what others have left goes before it comes, and a checkpoint that is rotated
 away goes behind the newer one. `artifact.json` comes last and goes first, here and there.
+
+Of several machines, each with a disk of its own, the lead's sends; the others take from there what a stage
+reads and the checkpoint that a training goes on from, and put there what they have made of a shared stage.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -21,8 +24,12 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of, temporary_folder
 from motionloom.datasets.base.lock import LOCK_FILE, file_lock
 from motionloom.datasets.shards.store import open_store, read_stored
+from motionloom.pipeline.contract.units import WORK
 from motionloom.pipeline.launch.console import say
+from motionloom.pipeline.launch.process import local_rank
+from motionloom.pipeline.launch.team import Team
 from motionloom.pipeline.store.artifact import FILE_NAME
+from motionloom.pipeline.store.files import remove_tree
 from motionloom.pipeline.training.checkpointing import step_of
 
 STARTED = "started.json"
@@ -32,9 +39,14 @@ _LAST = (STARTED, FILE_NAME)
 
 
 class Mirror:
-    """The mirror of one run. As a context it ends when all that was due lies there."""
+    """The mirror of one run. As a context it ends when all that was due lies there.
 
-    def __init__(self, place: str, run: Path, console: Console) -> None:
+    `team` are the processes of the run where these are on several machines, `devices` of them on each.
+    """
+
+    def __init__(
+        self, place: str, run: Path, console: Console, team: Team | None = None, devices: int = 1
+    ) -> None:
         self.store = open_store(place)
         if self.store.place.startswith("http"):
             raise UserError(f"{place}: a web server is only read; name a bucket or a folder")
@@ -43,6 +55,8 @@ class Mirror:
         self._threads = ThreadPoolExecutor(1)
         self._due: set[str] = set()
         self._sent: dict[str, Future[None]] = {}
+        self._team = team or Team()
+        self._follows = self._team.rank >= devices and local_rank() == 0
 
     def __enter__(self) -> Self:
         return self
@@ -51,16 +65,72 @@ class Mirror:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._threads.shutdown()
-        failed = next(filter(None, (sent.exception() for sent in self._sent.values())), None)
-        if failed is not None and error is None:
+        if error is None:
+            self._flush()
+
+    def _flush(self) -> None:
+        """Wait until all that was due lies there."""
+        failed = next(filter(None, [sent.exception() for sent in self._sent.values()]), None)
+        if failed is not None:
             raise UserError(f"{failed}; the run is whole in {self._run}: the same command sends the rest")
 
-    def fetch(self, stages: Iterable[str]) -> None:
+    def fetch(self, stages: Sequence[str]) -> None:
         """Fetch stages that are further there than here, unless they are begun here with other settings."""
         self._run.mkdir(parents=True, exist_ok=True)
-        with file_lock(self._run / LOCK_FILE):  # all processes of the machine ask for it
+        if self._team.leads:
+            with file_lock(self._run / LOCK_FILE):  # all processes of the machine ask for it
+                for stage in stages:
+                    self._fetch(f"stages/{stage}")
+        self.spread(stages)
+
+    def spread(self, stages: Sequence[str]) -> None:
+        """Have all machines hold what the lead's has of some stages; all processes call it."""
+        if self._team.world == 1:
+            return
+        if self._team.leads:
             for stage in stages:
-                self._fetch(f"stages/{stage}")
+                if (self._run / "stages" / stage / STARTED).exists():
+                    self.send(stage)
+            self._flush()
+        self._team.meet()
+        if self._follows:
+            for stage in stages:
+                self._follow(f"stages/{stage}")
+        self._team.meet()
+
+    def collect(self, stage: str) -> None:
+        """Have the lead's machine hold the units of a shared stage that others have made; all call it."""
+        if self._team.world == 1:
+            return
+        self._team.meet()
+        work = f"stages/{stage}/{WORK}/"
+        if self._follows:
+            for path in sorted((self._run / work).glob("*.npz")):
+                self.store.put(path, work + path.name, sha256_of(path))
+        self._team.meet()
+        if self._team.leads:
+            for name in self.store.names(work):
+                if not (self._run / work / name.removeprefix(work)).exists():
+                    self.store.get(name, self._run / name)
+
+    def _follow(self, folder: str) -> None:
+        """Make this machine's folder of a stage what the lead has sent of it."""
+        here = self._run / folder
+        there = self.store.names(folder)
+        last = f"{folder}/{FILE_NAME if f'{folder}/{FILE_NAME}' in there else STARTED}"
+        if last not in there:
+            if not (here / FILE_NAME).exists():
+                remove_tree(here)
+            return
+        mine = self._run / last
+        is_finished = (here / FILE_NAME).exists()
+        if mine.exists() and mine.read_bytes() == read_stored(self.store, last):
+            checkpoints = map(str, here.glob("checkpoints/*"))
+            as_far = not is_finished and _newest(checkpoints) == _newest(there)
+            if mine.name == FILE_NAME or as_far:
+                return
+        remove_tree(here)
+        self._fetch(folder)
 
     def _fetch(self, folder: str) -> None:
         here = self._run / folder
@@ -80,8 +150,8 @@ class Mirror:
             self.store.get(f"{folder}/{name}", here / name)
 
     def send(self, stage: str) -> None:
-        """Have the state of a stage put there soon."""
-        if stage not in self._due:
+        """Have the state of a stage put there soon, where this process leads."""
+        if self._team.leads and stage not in self._due:
             self._due.add(stage)
             self._sent[stage] = self._threads.submit(self._send, stage)
 

@@ -76,7 +76,7 @@ job would be over, and failed, before SLURM queues it again: the script does so 
 _WAIT = """\
 child=$!
 [ -z "$early" ] || pass_on "$early"
-# Not by `wait`: bash loses the code of what ends while a signal interrupts it. A signal waits for `sleep` instead.
+# Not by `wait`: bash loses the code of what ends while a signal interrupts it. A signal waits for `sleep`.
 while kill -0 "$child" 2> /dev/null; do
   sleep 1
 done

@@ -4,6 +4,7 @@ same commands go on with the same bytes, by torchrun and without it, on one node
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -161,6 +162,46 @@ def test_a_node_that_dies_is_named_by_the_other(starts: Starts, dead: int) -> No
     starts.end_with(*[-signal.SIGKILL, LOST][:: 1 - 2 * dead])
     named = f": rank {dead} (process {starts.processes[dead].pid} on "
     assert named in starts.said and ".cpp:" not in starts.said
+
+
+APART = (
+    RECIPE.partition("stages:")[0]
+    + """
+stages:
+  data: {kind: synth, clips: 24, min_seconds: 2.0, max_seconds: 5.0, layout: body133}
+  stats: {kind: stats}
+  toy:
+    kind: vq
+    net: {width: 16, depth: 1, code_dim: 8, num_codes: 16}
+    train: {steps: 24, batch_size: 8, checkpoint_every: 2, validate_every: 12}
+  tokens: {kind: tokens, inputs: {tokenizer: toy}, batch_frames: 256}
+"""
+)
+
+
+@pytest.mark.slow
+def test_machines_with_disks_of_their_own_have_all_by_the_mirror(starts: Starts) -> None:
+    """Each is lost in turn with its disk, and the figures are those of two that share one."""
+    (starts.folder / "toys.yaml").write_text(APART)
+    starts.nodes("toys.yaml", "-o", "shared")
+    starts.end_with(0, 0)
+    words = [("toys.yaml", "--mirror", "mirror", "-o", run) for run in ("run", "own/run")]
+    for lost in (1, 0):
+        starts.processes.clear()
+        starts.nodes(*words[0], second=words[1], pause=0.05)
+        steps = [int(path.stem[5:]) for path in starts.folder.glob("run/stages/toy/checkpoints/s*.ckpt")]
+        starts.reach(max(steps, default=0) + 4)
+        starts.processes[lost - 2].kill()
+        starts.end_with(*[-signal.SIGKILL, LOST][:: 1 - 2 * lost])
+        shutil.rmtree(starts.folder / ("run", "own")[lost])
+    starts.nodes(*words[0], second=words[1])
+    starts.end_with(0, 0)
+    for stage in ("data", "toy", "tokens"):
+        assert finished_files(starts.folder / f"run/stages/{stage}") == finished_files(
+            starts.folder / f"shared/stages/{stage}"
+        )
+    assert "fetched from" in starts.said and "resuming toy" in starts.said
+    assert len([*starts.folder.glob("mirror/stages/*/artifact.json")]) == 4
 
 
 @pytest.mark.parametrize(
