@@ -44,6 +44,9 @@ FEW = 2
 _FUSED = {torch.float16, torch.bfloat16}
 """Types of products with which a step is fused."""
 
+_KINDS = 64
+"""Ways in which a function may be compiled, by network, rows and drawing; of torch's eight a server runs out."""
+
 
 def advance(gpt: InterleavedGPT, rows: Rows, cache: KVCache) -> None:
     """Draw the next token of each row behind those that the cache holds."""
@@ -144,11 +147,11 @@ class FixedSteps:
 
     def record(self, step: Callable[[], None]) -> Callable[[], None]:
         """The step as a graph. Where torch.compile fails there is a warning, and it goes on without."""
-        from torch._dynamo import exc
+        from torch._dynamo import config, exc
 
         if self.advance is advance_fused:
             try:
-                with self.unchanged():
+                with self.unchanged(), config.patch(recompile_limit=_KINDS):
                     step()
             except (exc.TorchDynamoException, exc.FailOnRecompileLimitHit) as error:
                 reason = str(getattr(error, "inner_exception", error)).strip() or type(error).__name__

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache, partial
+from itertools import product
 
 import pytest
 import torch
 from toy_gpt import row_of, toy_gpt
 
 from motionloom.models.gpt import decoding, sampling
+from motionloom.models.gpt.rows import Drawing
 from motionloom.models.gpt.sampling import generate
 
 
@@ -41,6 +44,25 @@ def test_tokens_of_float32(plain: None, monkeypatch: pytest.MonkeyPatch, few: in
     for row in range(12):
         assert row_of(found, row) == row_of(rows[row], 0)
     assert sizes[0] == 12 and sizes[-1] < 12, "rows have left"
+
+
+@pytest.mark.parametrize(
+    ("backend", "ways"), [("eager", 4), pytest.param("inductor", 1, marks=pytest.mark.slow)]
+)
+def test_compiled(monkeypatch: pytest.MonkeyPatch, backend: str, ways: int) -> None:
+    """More ways of drawing than torch compiles a function in; where it gave up there would be a warning."""
+    monkeypatch.setattr(decoding, "_FUSED", {torch.float32})
+    monkeypatch.setattr(decoding, "_compiled", cache(partial(torch.compile, fullgraph=True, backend=backend)))
+    gpt = toy_gpt(std=0.2)
+    hows = Drawing(), Drawing(0), Drawing(1.3, 3), Drawing(0.7, None, 0.9)
+    for how, rows, scale in product(hows[:ways], (1, 3), (1.0, 2.5)):
+        text = torch.randn(rows, 6)
+        want = generate(gpt, text, how=how, cfg_scale=scale)
+        with monkeypatch.context() as fixed:
+            fixed.setattr(sampling, "_FIXED", {"cpu"})
+            found = generate(gpt, text, how=how, cfg_scale=scale)
+        assert [row_of(found, row) for row in range(rows)] == [row_of(want, row) for row in range(rows)]
+        assert decoding._KEPT[gpt].advance is decoding.advance_fused
 
 
 def test_distribution_of_bfloat16(plain: None, monkeypatch: pytest.MonkeyPatch) -> None:
