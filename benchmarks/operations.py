@@ -1,15 +1,16 @@
 """Operations of a training step at the papers' sizes: how many, and how much of them is copying.
 
     python benchmarks/operations.py
-    python benchmarks/operations.py --token
+    python benchmarks/operations.py --token --record operations_token
 
 A step (both passes, clipping, optimizer) in bf16, batch and loss as the recipe has them, on fake tensors:
 seconds on any machine. Views count nothing, attention as a GPU's fused kernel. What a library does inside an
 operation, such as cudnn's changes of layout, is not seen.
 
-With `--token`, what a GPU starts for a token of the GPT of 18 layers in bf16: of the plain step all
-operations but views; of the fused one these outside of compiled code, and inside of it the kernels that are
-left when inductor has fused what it can. It compiles for this CPU; for a GPU it fuses about as much.
+With `--token`, what a GPU starts for a token of the GPT of 18 layers: of the plain step all operations but
+views; of the fused one these outside of compiled code, and inside of it the kernels that are left when
+inductor has fused what it can. It compiles for this CPU; for a GPU it fuses about as much. Then what is
+computed for requests of the paper's lengths: places of the cache that are attended to, and rows of the batch.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from motionloom.models.gpt.rows import Drawing, Rows
 from motionloom.models.layers.attention import SelfAttention
 from motionloom.models.tokenizer.base import Stream
 from motionloom.pipeline.contract.lookup import previews
+from motionloom.pipeline.inference.generation import batches_by_length
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.training.execution import prepare_module
 
@@ -119,11 +121,33 @@ def row(title: str) -> Record:
     return {"title": title, "cells": whole | each}
 
 
-def token(rows: int) -> Record:
-    """What one token of so many motions starts; widths do not matter for it."""
+TOKEN = (
+    Column("plain, float32", "float32"),
+    Column("plain, bfloat16", "bfloat16"),
+    Column("blocks fused", "fused"),
+    Column("few rows as sums", "sums"),
+)
+WORK = (Column("of a batch of fixed shape", "fixed"), Column("now", "now"), Column("graphs", "graphs"))
+GROUPS = 49
+"""Most groups of a request, of four frames each."""
+
+
+def gpt_rows(layers: int, rows: int, limit: Tensor) -> tuple[InterleavedGPT, Rows]:
+    """A GPT of the paper's depth or less, and rows of it; widths do not matter for a count."""
     streams = (Stream("body", 512, 2), Stream("hand", 512, 1))
-    config = GptConfig(layers=18, dim=64, heads=4, ff=128)
+    config = GptConfig(layers=layers, dim=64, heads=4, ff=128)
     gpt = InterleavedGPT(config, streams, ("body", "body", "hand"), text_dim=8).eval()
+    most = -(-int(limit.max()) * 3 // decoding.ROOM) * decoding.ROOM
+    uniform = torch.rand(rows, most, dtype=torch.float64)
+    start = torch.zeros(rows, most, dtype=torch.int64)
+    first = gpt.embed_text(torch.randn(rows, 8))
+    how = Drawing()
+    drawn = Rows(gpt, start, limit * 0, limit, first=first, uniform=uniform, free=False, how=how, scale=None)
+    return gpt, drawn
+
+
+def token(rows: int) -> Record:
+    """What one token of so many motions starts."""
     counts = Counted()
     fused: Counter[str] = Counter()
     kernels: dict[object, int] = {}
@@ -144,25 +168,65 @@ def token(rows: int) -> Record:
         return call
 
     cells = {}
-    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
-        first = gpt.embed_text(torch.randn(rows, 8))
-        limit = torch.full((rows,), 2)
-        uniform = torch.rand(rows, 32, dtype=torch.float64)
-        start = torch.zeros(rows, 32, dtype=torch.int64)
-        drawn = Rows(
-            gpt, start, limit * 0, limit, first=first, uniform=uniform, free=True, how=Drawing(), scale=None
-        )
-        for name, step in {"plain": decoding.advance, "fused": decoding.advance_fused}.items():
-            with (
-                mock.patch.object(decoding, "_FUSED", set()),
-                mock.patch.object(decoding, "_compiled", compiled),
-            ):
-                steps = decoding.FixedSteps(None, gpt, drawn)
-                counts.number.clear()
-                with counts:
-                    step(steps.gpt, steps.rows, steps.cache)
-            cells[name] = f"{counts.number.total() + fused.total()}"
+    ways = {"float32": 0, "bfloat16": 0, "fused": 0, "sums": decoding.FEW}
+    for name, few in ways.items():
+        fused.clear()
+        kernels.clear()
+        torch.compiler.reset()
+        with (
+            torch.no_grad(),
+            torch.autocast("cpu", torch.bfloat16, enabled=name != "float32"),
+            mock.patch.object(decoding, "FEW", few),
+            mock.patch.object(decoding, "_compiled", compiled),
+        ):
+            steps = decoding.FixedSteps(None, *gpt_rows(18, rows, torch.full((rows,), 2)))
+            counts.number.clear()
+            with counts:
+                step = decoding.advance_fused if name in ("fused", "sums") else decoding.advance
+                step(steps.gpt, steps.rows, steps.cache)
+        cells[name] = f"{counts.number.total() + fused.total()}"
     return {"title": f"{rows} at once", "cells": cells}
+
+
+def places() -> list[Record]:
+    """Places attended to, a token, of one graph of fixed shape and of one each `ROOM` places."""
+    out = []
+    for groups in (17, GROUPS):
+        tokens = 3 * groups
+        fixed = -(-tokens // decoding.ROOM) * decoding.ROOM
+        seen = [(number // decoding.ROOM + 1) * decoding.ROOM for number in range(tokens)]
+        cells = {"fixed": f"{fixed}", "now": f"{sum(seen) / tokens:.0f}", "graphs": f"{len(set(seen))}"}
+        out.append({"title": f"places attended to, a token of {tokens}", "cells": cells})
+    return out
+
+
+def left() -> list[Record]:
+    """Rows computed, a token of 1,024 requests of 4 to 49 groups: 256 at once as they come, all in one batch
+    each to its end; then without rows that have ended, then sorted by length, too."""
+    groups = torch.randint(4, GROUPS + 1, (1024,), generator=torch.Generator().manual_seed(0))
+    wanted = int(groups.sum()) * 3
+    frames = (4 * groups).tolist()
+    came = [list(range(i, i + 256)) for i in range(0, 1024, 256)]
+    fixed = sum(3 * int(groups[rows].max()) * len(rows) for rows in came)
+    out = []
+    for title, batches in {"as they come": came, "sorted": batches_by_length(frames, 256)}.items():
+        shapes = Counter[tuple[int, int]]()
+        for batch in batches:
+            _, rows = gpt_rows(1, len(batch), groups[batch])
+
+            def step(number: int, rows: Rows = rows, shapes: Counter[tuple[int, int]] = shapes) -> None:
+                shapes[len(rows.tokens), number // decoding.ROOM] += 1
+                rows.at += 1
+
+            rows.run(step, lambda _: None)
+        computed = sum(size * steps for (size, _), steps in shapes.items())
+        cells = {
+            "fixed": f"{fixed / wanted:.2f}",
+            "now": f"{computed / wanted:.2f}",
+            "graphs": f"{len(shapes)}",
+        }
+        out.append({"title": f"rows computed for one that is drawn, {title}", "cells": cells})
+    return out
 
 
 def _groups(found: list[int], nodes: list[Any]) -> list[Any]:
@@ -178,8 +242,9 @@ def main() -> None:
     args = arguments(parser)
     record = args.record
     if args.token:
-        columns = [Column("plain", "plain"), Column("fused", "fused")]
-        report("What a sampled token starts, 18 layers, bfloat16", columns, [token(1), token(256)], record)
+        report("What a sampled token starts, 18 layers", TOKEN, [token(1), token(256)], record)
+        work = f"{record}_work" if record else None
+        report("What is computed for a sampled token", WORK, [*places(), *left()], work)
         return
     report("Operations of a training step", COLUMNS, [row(title) for title in STAGES], record)
 

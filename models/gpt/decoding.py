@@ -45,7 +45,7 @@ _FUSED = {torch.float16, torch.bfloat16}
 """Types of products with which a step is fused."""
 
 _KINDS = 64
-"""Ways in which a function may be compiled, by network, rows and drawing; of torch's eight a server runs out."""
+"""Ways in which a function is compiled, by network, rows and drawing; of torch's eight a server runs out."""
 
 
 def advance(gpt: InterleavedGPT, rows: Rows, cache: KVCache) -> None:
