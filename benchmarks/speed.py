@@ -1,14 +1,19 @@
 """Speed of what runs often, beside the usual way to do the same: the table "Speed" of docs/results.md.
 
-    python benchmarks/speed.py [--only audio batches workers] [--record speed]
+    python benchmarks/speed.py [--only audio batches workers] [--t2m-gpt FOLDER] [--record speed]
 
 All on one core, in CPU seconds, which other programs on the machine hardly change; two ways of one case take
-turns. `workers` is wall time of a loader process and the one that reads from it, on a quiet machine.
+turns. `workers` adds up a loader process and the one that reads from it. `vq` needs T2M-GPT's public code,
+https://github.com/Mael-zys/T2M-GPT, in FOLDER.
 """
 
 from __future__ import annotations
 
+import importlib
 import itertools
+import multiprocessing
+import os
+import sys
 import tempfile
 import time
 import warnings
@@ -16,6 +21,7 @@ from argparse import Namespace
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import torch
@@ -36,8 +42,10 @@ from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 from motionloom.datasets.text.build import build_with_encoder
 from motionloom.datasets.text.encoder import EncodedText
+from motionloom.models.tokenizer.module import TokenizerModule
 from motionloom.models.training.stage_module import Batch
 from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.store.tokens import TokenBatches, TokenCaptions, TokenStore
 from motionloom.pipeline.training.loaders import ROOMS, Loader
 
@@ -170,15 +178,25 @@ def batches(args: Namespace) -> Record:
     return row("a training batch of 256 at the paper's size", times, copied)
 
 
+def busy() -> float:
+    """CPU seconds of this process and of its loader processes so far."""
+    seconds = time.process_time()
+    for child in multiprocessing.active_children():
+        times = Path(f"/proc/{child.pid}/stat").read_text().rpartition(")")[2].split()[11:13]
+        seconds += sum(map(int, times)) / os.sysconf("SC_CLK_TCK")
+    return seconds
+
+
 def workers(args: Namespace) -> Record:
-    """Wall time from batch to batch of one loader process, as for a GPU, and as torch alone sends them."""
+    """CPU time of a batch of one loader process and its reader, as for a GPU, and as torch alone sends it."""
     begins = 10
-    count = 60
+    count = 100
     ours = []
     usual = []
     with tempfile.TemporaryDirectory() as folder:
         for own in paper_batches(folder).values():
-            steps = Steps(lambda rank, world, own=own: own, begins + count)
+            # More than are read, so that the process is as far ahead at the end as at the beginning.
+            steps = Steps(lambda rank, world, own=own: own, begins + count + 10)
             one = Hardware(accelerator="cpu", workers=1)
             packed = Loader(steps, one, torch.device("cpu"), once=True)
             packed._opened = packed._open()
@@ -188,21 +206,68 @@ def workers(args: Namespace) -> Record:
                 coming = iter(load)
                 for k in range(begins + count):
                     if k == begins:
-                        began = time.perf_counter()
+                        began = busy()
                     next(coming)
-                times.append(f"{1e3 * (time.perf_counter() - began) / count:.0f}")
+                times.append(f"{1e3 * (busy() - began) / count:.0f}")
+                for _ in coming:  # so that the process ends by itself
+                    pass
             packed.close()
     return row("from one loader process", f"{', '.join(ours)} ms", f"sent by torch: {', '.join(usual)} ms")
 
 
-CASES = {case.__name__: case for case in (audio, batches, workers)}
+def vq(args: Namespace) -> Record:
+    """A training step of T2M-GPT's tokenizer, here and by its public code, in float32 and in bfloat16."""
+    config = load_recipe("t2m-gpt-paper").stage("tokenizer").config
+    module = TokenizerModule(
+        config.net.build(MotionLayout.named("h3d263")), config.optim, seed=0, max_steps=100
+    )
+    own = module.train().configure_optimizers()[0]["optimizer"]
+    sys.path.insert(0, args.t2m_gpt)
+    losses = importlib.import_module("utils.losses").ReConsLoss("l1_smooth", 22)
+    network = importlib.import_module("models.vqvae").HumanVQVAE
+    options = Namespace(quantizer="ema_reset", dataname="t2m", mu=0.99)
+    with mock.patch.object(torch.Tensor, "cuda", lambda tensor: tensor):
+        theirs = network(options, down_t=2, stride_t=2).train()
+    other = torch.optim.AdamW(theirs.parameters(), lr=2e-4, betas=(0.9, 0.99), weight_decay=0.0)
+    motion = torch.randn(BATCH, WINDOW, 263)
+    batch = {"motion": motion, "length": torch.full((BATCH,), WINDOW), "full": True}
+
+    def ours() -> None:
+        loss = module.training_step(batch, 0)
+        own.zero_grad()
+        loss.backward()
+        module.configure_gradient_clipping(own)
+        own.step()
+        module.step += 1
+
+    def public() -> None:
+        made, commit, _ = theirs(motion)
+        loss = losses(made, motion) + 0.02 * commit + 0.5 * losses.forward_vel(made, motion)
+        other.zero_grad()
+        loss.backward()
+        other.step()
+
+    taken = []
+    for half in (False, True):
+        with torch.autocast("cpu", torch.bfloat16, enabled=half):
+            taken.append(cpu_seconds({"ours": ours, "public": public}, 5))
+    times = {name: ", in bfloat16 ".join(f"{one[name]:.2f} s" for one in taken) for name in taken[0]}
+    shown = row("a step of T2M-GPT's tokenizer", times["ours"], f"{times['public']}, its public code")
+    shown["cells"]["ratio"] = [one["public"] / one["ours"] for one in taken]
+    return shown
+
+
+CASES = {case.__name__: case for case in (audio, batches, workers, vq)}
 
 
 def main() -> None:
     parser = command_line(__doc__)
-    parser.add_argument("--only", nargs="+", choices=CASES, default=list(CASES))
+    parser.add_argument("--only", nargs="+", choices=CASES)
+    parser.add_argument("--t2m-gpt", metavar="FOLDER", help="its public code, for the case vq")
     args = arguments(parser)
-    report("Speed on one core", COLUMNS, [CASES[name](args) for name in args.only], args.record)
+    torch.set_num_threads(1)
+    only = args.only or [name for name in CASES if name != "vq" or args.t2m_gpt]
+    report("Speed on one core", COLUMNS, [CASES[name](args) for name in only], args.record)
 
 
 if __name__ == "__main__":
