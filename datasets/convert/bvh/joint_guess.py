@@ -1,9 +1,12 @@
 """The joint map of a figure whose joints a known tool has named (`tools.py`).
 
-1. Legs and arms are those of the first convention that has all their names, on both sides.
+1. Legs and arms are those of the first convention that has all their names, on both sides. Where none has,
+   words of several tools count that stand in a limb's order along one chain, alike on both sides; one of the
+   three joints may have a strange name where the tree leaves only it.
 2. Pelvis, spine and neck lie between and above them: a joint that is missing is a mean of its neighbours.
-3. The ball of a foot without a name is the End Site of the ankle, or estimated: at right angles to the shin,
-   forward of the hips, as far away as in our own skeleton, written into the map as an End Site.
+3. The ball of a foot without a name is the only joint below the ankle or its End Site, or estimated: at right
+   angles to the shin, forward of the hips, as far away as in our own skeleton, written into the map as an End
+   Site.
 4. Fingers by name alone: too many hands have four joints a finger.
 
 What is not certain is not guessed: its row stays empty. All of it is [ours]. Whether names tell the truth is
@@ -15,13 +18,13 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import replace
 from functools import reduce
-from itertools import pairwise
+from itertools import islice, pairwise, product
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.convert.bvh.tools import CONVENTIONS, FINGERS, by_word
+from motionloom.datasets.convert.bvh.tools import CONVENTIONS, ENDS, FINGERS, WORDS, read_names
 from motionloom.datasets.motion.bvh.joint_map import JointMap
 from motionloom.datasets.motion.bvh.motion import END, BvhMotion
 from motionloom.datasets.motion.skeleton import Skeleton
@@ -45,7 +48,11 @@ _FOOT = (0.12, 0.75)
 _AHEAD = 0.5
 """Cosine between the way to it and forward that it has at least: others point down, or back to a heel."""
 
+_CHOICES = 20_000
+"""Joints of one limb that are tried: hands of strange names have hundreds, a file of one name billions."""
+
 _SIDES = ("left", "right")
+Kind = Literal["leg", "arm"]
 Limb = tuple[int, int, int]
 """Hip, knee and ankle, or shoulder, elbow and wrist."""
 
@@ -81,8 +88,8 @@ def summary(guess: JointMap) -> str:
     means = sum(len(names) > 1 for names in guess.sources)
     named = len(guess.sources) - len(guess.open_rows) - means - len(feet)
     counts = {
-        "by name": named, "as means": means, "estimated" if guess.ends else "at End Sites": len(feet),
-        "open": len(guess.open_rows),
+        "by name and tree": named, "as means": means,
+        "estimated" if guess.ends else "at End Sites": len(feet), "open": len(guess.open_rows),
     }  # fmt: skip
     found = ", ".join(f"{count} {how}" for how, count in counts.items() if count)
     return f"{found}; {len(guess.unmapped)} of the source's joints stand for nothing"
@@ -98,7 +105,9 @@ class _Figure:
         self.joints = ended.joints
         self.parents = ended.parents
         self.poses = ended.positions()
-        self.named = by_word(motion.joints)
+        self.read = read_names(motion.joints)
+        counts = Counter(self.read)
+        self.named = {key: joint for joint, key in enumerate(self.read) if counts[key] == 1}
         self.extent = float(np.median(np.ptp(self.poses, axis=1).max(axis=-1)))
 
     def length(self, a: int, b: int) -> float:
@@ -135,14 +144,52 @@ class _Figure:
                 out.append(joint)
         return out[1:]
 
-    def limbs(self, kind: Literal["leg", "arm"]) -> tuple[Limb, Limb] | None:
+    def limbs(self, kind: Kind) -> tuple[Limb, Limb] | None:
         """The left and the right one, in the words of the first tool that fits."""
         first = int(kind == "arm")  # an arm's first word is the collar
         for known in CONVENTIONS:
             words = getattr(known, kind)[first : first + 3]
             left, right = ([self.named.get((side, word), -1) for word in words] for side in _SIDES)
-            if min(*left, *right) >= 0 and self.is_chain(*left) and self.is_chain(*right):
+            if min(*left, *right) >= 0 and self._is_whole(kind, left) and self._is_whole(kind, right):
                 return (left[0], left[1], left[2]), (right[0], right[1], right[2])
+        one, other = (self._limb(kind, side) for side in _SIDES)
+        words = [[self.read[joint][1] for joint in limb or ()] for limb in (one, other)]
+        return (one, other) if one and other and words[0] == words[1] else None
+
+    def _is_whole(self, kind: Kind, limb: list[int]) -> bool:
+        """Whether each is above the next, and no other joint between them has a word of such a limb."""
+        words = {word for known in CONVENTIONS for word in getattr(known, kind)}
+        own = tuple(self.read[joint][1] for joint in limb)
+        # `upperarm1` is a part of `upperarm`.
+        return self.is_chain(*limb) and not any(
+            word in words and not word.startswith(own)
+            for _, word in map(self.read.__getitem__, self.way(limb[0], limb[2]))
+        )
+
+    def _limb(self, kind: Kind, side: str) -> Limb | None:
+        """One whose words are of several tools, or of which one joint has a strange name; None in doubt."""
+        first = int(kind == "arm")
+        rows = [getattr(known, kind) for known in CONVENTIONS]
+        own = {joint: word for joint, (where, word) in enumerate(self.read) if where == side and word}
+        fits = [[joint for joint, word in own.items() if word in slot] for slot in zip(*rows, strict=True)]
+        strange = [joint for joint, word in own.items() if word not in WORDS and not word.endswith(ENDS)]
+        for holes in ((-1,), range(first, first + 3)):
+            found: dict[tuple[bool, int], set[Limb]] = {}
+            for hole in holes:
+                places = [strange if slot == hole else fit for slot, fit in enumerate(fits)]
+                places[0 if first else 3] = [-1, *fits[0 if first else 3]]
+                # One word may mean two joints: `leg` is a knee or a hip. The others of its chain tell which.
+                for choice in islice(product(*places), _CHOICES):
+                    if self.is_chain(*(joint for joint in choice if joint >= 0)):
+                        words = [own.get(joint) for joint in choice]
+                        agree = max(sum(a == b for a, b in zip(words, row, strict=True)) for row in rows)
+                        a, b, c = choice[first : first + 3]
+                        found.setdefault((min(choice) >= 0, agree), set()).add((a, b, c))
+            best = found[max(found)] if found else set()
+            limb = best.pop() if len(best) == 1 else None
+            # A joint between two of them could as well be one of the three.
+            if limb and all(len(self.way(a, b)) == 1 for a, b in pairwise(limb)):
+                return limb
         return None
 
 
@@ -161,6 +208,16 @@ def _trunk(figure: _Figure, legs: tuple[Limb, Limb], arms: tuple[Limb, Limb]) ->
     rows |= _spine(pelvis, figure.way(pelvis, figure.parents[chest] if hung else chest))
     heads = [figure.named.get(("", known.neck[1]), -1) for known in CONVENTIONS]
     head = next((joint for joint in heads if joint >= 0 and figure.is_chain(chest, joint)), None)
+    if head is None:
+        # A strange neck and head are certain when they are all there is: of three, any two could be meant.
+        free = [
+            joint
+            for joint in figure.below(chest)
+            if joint < len(figure.motion.joints)
+            and not figure.read[joint][1].endswith(ENDS)
+            and all(figure.branch(joint, shoulder) == chest for shoulder in shoulders)
+        ]
+        head = free[-1] if len(free) == 2 - hung and figure.is_chain(*free) else None
     if head is not None:
         necks = [chest] if hung else figure.way(chest, figure.parents[head])
         rows |= {"head": (head,), "neck": tuple(necks[:1]) or (chest, head, head)}
@@ -214,8 +271,8 @@ def _feet(
         named = [figure.named.get((side, word), -1) for word in words]
         if own := [joint for joint in named if joint in joints]:
             toes[f"{side}_foot"] = (own[0],)
-    # An estimate is for figures without any foot joint: of two feet, one open is rather a wrong name.
-    if toes or any(joint < len(figure.motion.joints) for joints in below for joint in joints):
+    # Of two feet, one open is rather a wrong name; and so is one with a toe beside a heel.
+    if toes or not all(figure.is_chain(*joints) for joints in below):
         return toes, {}
     hips = [figure.poses[:, leg[0]] for leg in legs]
     found: dict[str, tuple[int, ...]] = {}
@@ -237,8 +294,9 @@ def _feet(
         share = shin / figure.length(figure.parents[ankle], ankle)
         x, y, z = (local * (share * np.hypot(_FORWARD, _DOWN) / np.linalg.norm(local))).tolist()
         ends[figure.joints[ankle]] = (x, y, z)
-    if len(found) == len(legs):
-        return found, {}
+    # An estimate is for figures without any foot joint.
+    if len(found) == len(legs) or any(joints[0] < len(figure.motion.joints) for joints in below if joints):
+        return (found if len(found) == len(legs) else {}), {}
     behind = len(figure.joints)  # names of all joints' End Sites
     return {f"{side}_foot": (behind + leg[2],) for side, leg in zip(_SIDES, legs, strict=True)}, ends
 

@@ -51,8 +51,15 @@ def _conventions() -> Iterator[Convention]:
 
 
 CONVENTIONS = tuple(_conventions())
-_WORDS = {word for known in CONVENTIONS for word in known.words()}
-_SIDES = {"left": "left", "lft": "left", "l": "left", "right": "right", "rgt": "right", "r": "right"}
+WORDS = {word for known in CONVENTIONS for word in known.words()}
+ENDS = ("end", "nub", "tip", "top")
+"""Words of the ends of chains, which are no joints of the body."""
+_SIDES = {
+    "left": "left", "lft": "left", "lt": "left", "l": "left", "左": "left",
+    "right": "right", "rgt": "right", "rt": "right", "r": "right", "右": "right",
+}  # fmt: skip
+_MIDDLE = ("m", "c")
+"""Maya's `Head_M` and Unreal's `head_c` are of no side."""
 
 _NAMESPACE = re.compile(r"[:|/]")
 _PIECE = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_a-zA-Z]+")
@@ -62,8 +69,8 @@ _MOST = 0.6
 """Words that so large a share of all names begin or end with are the tool's prefix, and say nothing."""
 
 
-def by_word(joints: Sequence[str]) -> dict[tuple[str, str], int]:
-    """The joint of each side (`left`, `right` or empty) and word, where it is the only one."""
+def read_names(joints: Sequence[str]) -> list[tuple[str, str]]:
+    """Side (`left`, `right` or empty) and word of every joint; no word for helpers."""
     names = [_NAMESPACE.split(name)[-1] for name in joints]
     pieces = [_pieces(name) for name in names]
     for end, trimmed in ((0, slice(1, None)), (-1, slice(None, -1))):
@@ -71,10 +78,9 @@ def by_word(joints: Sequence[str]) -> dict[tuple[str, str], int]:
             pieces = [
                 piece[trimmed] if len(piece) > 1 and piece[end] == common else piece for piece in pieces
             ]
-    read = [_read(piece) for piece in pieces]
-    helpers = [bool(_HELPER.search(name)) for name in names]
-    counts = Counter(key for key, helper in zip(read, helpers, strict=True) if not helper)
-    return {key: i for i, key in enumerate(read) if counts[key] == 1 and not helpers[i]}
+    return [
+        ("", "") if _HELPER.search(name) else _read(piece) for name, piece in zip(names, pieces, strict=True)
+    ]
 
 
 def _pieces(name: str) -> list[str]:
@@ -94,9 +100,9 @@ def _common(pieces: list[list[str]], end: int) -> str:
 def _read(pieces: list[str]) -> tuple[str, str]:
     """Side and word of one name."""
     sides = {_SIDES[piece] for piece in pieces if piece in _SIDES}
-    word = "".join(piece for piece in pieces if piece not in _SIDES)
-    if not sides and word not in _WORDS:  # `lfemur`, `leftupleg`, `hipleft`: nothing stands between
+    word = "".join(piece for piece in pieces if piece not in _SIDES and piece not in _MIDDLE)
+    if not sides and word not in WORDS:  # `lfemur`, `leftupleg`, `hipleft`: nothing stands between
         for side_word in sorted(_SIDES, key=len, reverse=True):
-            if cut := {word.removeprefix(side_word), word.removesuffix(side_word)} & _WORDS:
+            if cut := {word.removeprefix(side_word), word.removesuffix(side_word)} & WORDS:
                 return _SIDES[side_word], cut.pop()
     return (sides.pop() if len(sides) == 1 else ""), word

@@ -72,7 +72,10 @@ def check_id(clip_id: str, where: str) -> str:
         )
         or ":" in parts[0]
     ):
-        raise UserError(f"{where}: clip id '{clip_id[:80]!s}' is not a plain relative name")
+        raise UserError(
+            f"{where}: clip id '{clip_id[:80]!s}' is not a plain relative name; rename it, without \\ : "
+            f"tabs or .., and with at most {_LONGEST} bytes a part"
+        )
     return clip_id
 
 

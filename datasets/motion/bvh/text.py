@@ -144,6 +144,7 @@ def read_values(data: bytes, start: int, frames: int, width: int, where: str) ->
     counts = counts[counts > 0]
     wrong = np.flatnonzero(counts != width)
     if len(wrong):
+        _require_one_motion(data, start, where)
         row = int(wrong[0])
         raise UserError(
             f"{where}: line {lines[row]}: frame {row} (from 0) has {counts[row]} numbers, "
@@ -197,12 +198,21 @@ def require_frames(found: int, stated: int, where: str) -> None:
         raise UserError(f"{where}: the header says {stated} frames, {found} found")
 
 
+def _require_one_motion(data: bytes, start: int, where: str) -> None:
+    """`UserError` when a motion block that is wrong holds another one."""
+    if second := _MOTION.search(data, start):
+        line = data.count(b"\n", 0, second.start()) + 1
+        raise UserError(f"{where}: line {line}: a second MOTION section; split the file, one motion each")
+
+
 def count_frames(data: bytes, section: MotionSection, where: str) -> int:
     """Lines of values; `UserError` when they are not those of the header. The values are not read."""
     body = data[section.body :].strip()
     lines = body.count(b"\n") + bool(body)
     if lines != section.frames:  # blank lines count for nothing
         lines = sum(bool(line.strip()) for line in body.split(b"\n"))
+    if abs(lines - section.frames) > MISCOUNTED:
+        _require_one_motion(data, section.body, where)
     require_frames(lines, section.frames, where)
     return lines
 

@@ -131,6 +131,8 @@ def test_frame_rate_is_what_the_digits_mean(text: str, fps: float) -> None:
         ("Frames: 2", "Frames: 0", "Frames: 0"),
         ("Frames: 2", "Frames: 4", "4 frames, 2 found"),
         ("Frames: 2", "Frames: 2.5", "Frames: "),
+        (TINY, TINY + TINY, "a second MOTION section; split"),
+        (TINY, TINY + TINY[TINY.index("MOTION") :], "a second MOTION section; split"),
         ("Frames: 2", "Frames: " + "9" * 5000, "Frames: "),
         ("Frames: 2\n", "", "line 21: expected 'Frames"),
         (" -70", " -70x", "frame 1, channel 10 .*'-70x'"),
