@@ -2,7 +2,8 @@
 
 Captions that are not in the cache yet are divided by the first bits of their keys into parts of about 512.
 A part is encoded on one thread, in an order that depends on its captions alone: the bytes of the finished
-cache do not depend on how many processes made it.
+cache do not depend on how many processes made it, nor on how many machines. A part's file is named by what it
+holds, so that whoever finishes the cache takes what others have made, or what a killed process had made.
 
 Parts are ranges of ascending keys, so merging them, with what the cache held before, is one pass that
 streams to disk. The old files stay in place until all new ones are written.
@@ -10,6 +11,7 @@ streams to disk. The old files stay in place until all new ones are written.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -39,6 +41,10 @@ BATCH = 64
 """Captions encoded together: of one part, and of similar length."""
 
 
+ALL = (0, 1)
+"""The share of a process that makes all parts."""
+
+
 def build_text_cache(
     folder: Path | str,
     captions: Iterable[str],
@@ -47,7 +53,8 @@ def build_text_cache(
     progress: bool = True,
     device: str = "cpu",
     similarity: str | None = None,
-) -> TextCache:
+    share: tuple[int, int] = ALL,
+) -> TextCache | None:
     """Encode the captions that `folder` does not hold yet, in `workers` processes of one thread each.
 
     `encoder_name` as for `load_text_encoder`; another encoder's cache is replaced. The same captions give
@@ -55,20 +62,22 @@ def build_text_cache(
 
     `similarity` names the encoder whose sentence embeddings say which captions mean the same; None is
     `encoder_name`.
+
+    Process r of n encodes the parts of its `share` (r, n) alone, and returns nothing: another call, without a
+    share, finishes the cache of all parts.
     """
     folder = Path(folder)
     captions = set(captions)
     workers = workers if device == "cpu" else 1
     encoder = load_text_encoder(encoder_name, device=device)
-    build_with_encoder(folder, captions, encoder, progress, encoder_name, workers)
-    if similarity in (None, encoder_name):
-        shutil.rmtree(folder / SIMILARITY, ignore_errors=True)
-    else:
+    make = partial(_build, captions=captions, progress=progress, workers=workers, share=share)
+    make(folder, encoder=encoder, spec=encoder_name, load=load_text_encoder)
+    if similarity not in (None, encoder_name):
         other = load_sentences(similarity, device=device)
-        build_with_encoder(
-            folder / SIMILARITY, captions, other, progress, similarity, workers, load_sentences
-        )
-    return TextCache.open(folder)
+        make(folder / SIMILARITY, encoder=other, spec=similarity, load=load_sentences)
+    elif share == ALL:
+        shutil.rmtree(folder / SIMILARITY, ignore_errors=True)
+    return TextCache.open(folder) if share == ALL else None
 
 
 class SentencesOnly:
@@ -101,15 +110,26 @@ class _Part:
 
 
 def build_with_encoder(
+    folder: Path, captions: Iterable[str], encoder: TextEncoder, progress: bool = True
+) -> TextCache:
+    """The same in this process, with an encoder that is loaded already."""
+    _build(folder, captions, encoder, progress)
+    return TextCache.open(folder)
+
+
+def _build(
     folder: Path,
     captions: Iterable[str],
     encoder: TextEncoder,
-    progress: bool = True,
+    progress: bool,
     spec: str = "",
     workers: int = 1,
     load: Load = load_text_encoder,
-) -> TextCache:
-    """The same with an encoder that is loaded already; further `workers` get theirs by `load(spec)`."""
+    share: tuple[int, int] = ALL,
+) -> None:
+    """Encode this process's share of the parts, and finish the cache where that is all; further `workers` get
+    their encoder by `load(spec)`.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     wanted = {key_of(text): text for text in captions}
     if not wanted:
@@ -117,25 +137,24 @@ def build_with_encoder(
     old = _reusable(folder, encoder)
     rows = old.find(list(wanted.values())).tolist() if old else [-1] * len(wanted)
     new = sorted(key for key, row in zip(wanted, rows, strict=True) if row < 0)
-    if old is not None and not new:
-        return old
     place = folder / "parts"
-    shutil.rmtree(place, ignore_errors=True)
-    place.mkdir()
-    remove_temporaries(folder)
-    parts = _parts(new, wanted, place)
-    workers = min(workers, len(parts) // PARTS_A_WORKER)
+    parts = _parts(new, wanted, place, encoder.name)
+    missing = [part for part in parts[slice(share[0], None, share[1])] if not part.path.is_file()]
+    workers = min(workers, len(missing) // PARTS_A_WORKER)
     encode: Callable[[_Part], None] = partial(_encode_part, encoder=encoder)
     if workers > 1:
         encode = partial(_encode_elsewhere, load, spec, encoder.name)
     with Workers(workers) as pool:
-        done = pool.run(encode, parts)
-        for _ in track(done, "encoding captions", total=len(parts), disable=not progress):
+        done = pool.run(encode, missing)
+        for _ in track(done, "encoding captions", total=len(missing), disable=not (progress and missing)):
             pass
-    texts = {**(old.captions_by_key() if old else {}), **wanted}
-    _merge(folder, texts, parts, old, encoder)
-    shutil.rmtree(place)
-    return TextCache.open(folder)
+    if share != ALL:
+        return
+    if new or old is None:
+        remove_temporaries(folder)
+        texts = {**(old.captions_by_key() if old else {}), **wanted}
+        _merge(folder, texts, parts, old, encoder)
+    shutil.rmtree(place, ignore_errors=True)
 
 
 def _encode_elsewhere(load: Load, spec: str, expected: str, part: _Part) -> None:
@@ -160,15 +179,18 @@ def _reusable(folder: Path, encoder: TextEncoder) -> TextCache | None:
     return found if (found.encoder, found.dim) == (encoder.name, encoder.dim) else None
 
 
-def _parts(keys: Sequence[bytes], texts: dict[bytes, str], place: Path) -> list[_Part]:
+def _parts(keys: Sequence[bytes], texts: dict[bytes, str], place: Path, encoder: str) -> list[_Part]:
     """Parts of ascending keys, by their first bits: as many bits as make parts of at most PART on average."""
     bits = max(0, (len(keys) - 1) // PART).bit_length()
     groups: dict[int, list[bytes]] = {}
     for key in keys:
         groups.setdefault(int.from_bytes(key[:4], "big") >> (32 - bits), []).append(key)
     return [
-        _Part(place / f"{number}.npz", tuple(texts[key] for key in members))
-        for number, members in sorted(groups.items())
+        _Part(
+            place / f"{hashlib.sha256(b''.join([encoder.encode(), *members])).hexdigest()}.npz",
+            tuple(texts[key] for key in members),
+        )
+        for _, members in sorted(groups.items())
     ]
 
 
@@ -184,7 +206,8 @@ def _encode_part(part: _Part, encoder: TextEncoder) -> None:
         for i, states, mask in zip(rows, encoded.tokens, encoded.mask, strict=True):
             tokens[i] = states[mask].astype(np.float16)
     lengths = np.array([len(rows) for rows in tokens], dtype=np.int64)
-    np.savez(part.path, allow_pickle=False, sentence=sentence, lengths=lengths, tokens=np.concatenate(tokens))
+    with atomic_file(part.path) as file:
+        np.savez(file, allow_pickle=False, sentence=sentence, lengths=lengths, tokens=np.concatenate(tokens))
 
 
 def _merge(

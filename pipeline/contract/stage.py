@@ -245,8 +245,15 @@ class StageKind(ABC, Generic[C]):
     """Columns of its training log that the report draws."""
     shares: bool = False
     """Whether all processes of a run take part by `share` before the first of them runs the stage."""
+    light: bool = False
+    """Whether no processes are started for a kind that shares where nothing else wants them."""
     parts: bool = False
     """Whether `run` can make the part `hardware.part` alone, beside others; of a kind without inputs."""
+
+    @property
+    def heavy(self) -> bool:
+        """Whether all processes and GPUs are wanted for it."""
+        return self.trains or (self.shares and not self.light)
 
     def gives(self, config: C) -> frozenset[str]:
         """`offers`, where the config does not say otherwise."""

