@@ -2,6 +2,7 @@
 
     python benchmarks/motion_faults.py SHARED/data --record benchmarks/records/motion_faults.json
     python benchmarks/motion_faults.py SHARED/data --half tune     # the clips that bounds were chosen on
+    python benchmarks/motion_faults.py SHARED/data --copies 70     # near duplicates of so many of each set
 
 Each fault is put into the channels of clean BVH and AMC files: 200 files in which the judge finds nothing,
 of Bandai-Namco, CMU and HDM05. A fault counts as found when its clip is named for one of the fault's kinds.
@@ -24,11 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import sha256_of_json
+from motionloom.datasets.check.duplicates import likeness, near, signature
 from motionloom.datasets.convert.bvh.config import BvhClip, BvhConfig
 from motionloom.datasets.convert.bvh.convert import Bvh
 from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.motion.bvh.joint_map import JointMap
 from motionloom.datasets.motion.bvh.motion import BvhMotion, channel_columns
+from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.judge import STEPS, _falls, _swings, judge, on_floor
 from motionloom.datasets.motion.plausibility import measure
 
@@ -199,6 +202,58 @@ def kinds_of(converter: Bvh, clip: BvhClip, motion: BvhMotion, fault: str = "") 
     return {one.kind for one in judge(on_floor(joints), motion.fps)}
 
 
+def sliced(part: slice) -> Planted:
+    return lambda motion, joint_map, rng: with_values(motion, motion.values[part])
+
+
+def noisy(motion: BvhMotion, joint_map: JointMap, rng: np.random.Generator) -> BvhMotion:
+    values = motion.values.copy()
+    columns = [column for _, turns in channel_columns(motion.channels)[1] for column in turns]
+    values[:, columns] += rng.normal(0, 0.05, (len(values), len(columns)))
+    return with_values(motion, values)
+
+
+COPIES: dict[str, Planted] = {
+    "a frame off the start": sliced(slice(1, None)), "3 frames off the start": sliced(slice(3, None)),
+    "15 frames off the start": sliced(slice(15, None)), "2 % slower": faster(1 / 1.02),
+    "noise of 0.05 degrees": noisy,
+}  # fmt: skip
+"""What is made of a recording that stays the same one."""
+
+
+def count_copies(data: Path, count: int, folder: Path) -> None:
+    """Print how many copies of the first `count` recordings of each set are found, among all of them."""
+    joints: list[NDArray[Any]] = []
+    copies: dict[str, dict[int, NDArray[Any]]] = {name: {} for name in COPIES}
+    for name, (place, pattern) in SETS.items():
+        converter, clips = clips_of(data / place, pattern, folder / name)
+        for clip in clips[:count]:
+            made: dict[str, NDArray[Any]] = {}
+            motion = clip.read()
+            rng = np.random.default_rng(0)
+            for change, plant in {"": as_is, **COPIES}.items():
+                changed = plant(motion, converter.maps[clip.found.skeleton], rng)
+                clip_of_it = replace(clip, fps=changed.fps, frames=changed.frames)
+                seen = converter.world(clip, changed)[0]
+                made[change] = joints_of(converter.encode(clip_of_it, seen), converter.layout)
+            joints.append(made.pop(""))
+            for change, copy in made.items():
+                copies[change][len(joints) - 1] = copy
+    fps = converter.layout.fps
+    signed = [signature(one, fps) for one in joints]
+    alike = {(a, b) for a, b, at in near(signed) if likeness(joints[a], joints[b], fps, at).how}
+    print(f"{len(alike)} pairs of {len(joints)} recordings are taken for one", flush=True)
+    for change, those in copies.items():
+        owners = list(those)
+        pairs = near([*signed, *(signature(copy, fps) for copy in those.values())])
+        found = {
+            a for a, b, at in pairs
+            if b >= len(joints) and owners[b - len(joints)] == a
+            and likeness(joints[a], those[a], fps, at).how
+        }  # fmt: skip
+        print(f"{change:30} {len(found)} of {len(those)}", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("data", type=Path)
@@ -206,8 +261,13 @@ def main() -> None:
     parser.add_argument(
         "--clips", type=int, default=200, help="clips to plant in, and alarms: five times as many"
     )
+    parser.add_argument("--copies", type=int, help="count near duplicates instead, of so many clips of a set")
     parser.add_argument("--record", type=Path)
     options = parser.parse_args()
+    if options.copies:
+        with tempfile.TemporaryDirectory() as folder:
+            count_copies(options.data, options.copies, Path(folder))
+        return
     alarms: dict[str, dict[str, Any]] = {}
     clean: dict[str, list[tuple[Bvh, BvhClip]]] = defaultdict(list)
     with tempfile.TemporaryDirectory() as folder:

@@ -42,8 +42,10 @@ MOMENTS, NEIGHBOURS, _AXES = 5, 16, 12
 """Moments of a second, seconds that each is compared with, and axes in which that is done."""
 WHOLE = 0.9
 """Share of the shorter clip from which it is the same motion again."""
-_RATE, _WINDOW, _HOP, _AROUND = 20, 20, 2, 8
-"""Samples a second, of a window, and from one window to the next; samples around that are tried."""
+_RATE, _WINDOW, _HOP, _AROUND, _FINE, _SHIFTS = 20, 20, 2, 8, 4, 2
+"""Samples a second, of a window, and from one window to the next; samples around that are tried, parts of
+one, and shifts of a pair.
+"""
 
 _NAMED = Skeleton.named("smpl22")
 _PAIRS = [
@@ -174,7 +176,7 @@ def _sampled(joints: NDArray[np.floating], fps: float) -> NDArray[np.float64]:
 
 def near(signatures: list[NDArray[np.float32]]) -> Iterator[tuple[int, int, int]]:
     """Pairs (earlier, later) of clips of which several seconds, as far apart in both, hardly differ; and the
-    tenths of a second by which those of the later one begin later.
+    tenths of a second by which those of the later one begin later; a pair comes with its likeliest shifts.
     """
     from scipy.spatial import KDTree
 
@@ -209,12 +211,30 @@ def near(signatures: list[NDArray[np.float32]]) -> Iterator[tuple[int, int, int]
         axis=0,
         return_counts=True,
     )
-    best: dict[tuple[int, int], tuple[int, int]] = {}
+    shifts: dict[tuple[int, int], list[tuple[float, int]]] = {}
     for (earlier, later, shift), count in zip(pairs.tolist(), votes.tolist(), strict=True):
-        if count >= min(2, counts[earlier] // 6 + 1, counts[later] // 6 + 1):
-            best[earlier, later] = max(best.get((earlier, later), (0, 0)), (count, 4 * shift + 2))
-    for (earlier, later), (_, shift) in sorted(best.items(), key=lambda pair: pair[0][::-1]):
-        yield earlier, later, shift
+        shorter = min(counts[earlier], counts[later])
+        if count >= min(2, shorter // 6 + 1):
+            both = signatures[earlier], signatures[later]
+            # A few votes say little: all seconds of both are compared, as far apart as those that voted.
+            best = max((_nearness(*both, at), at) for at in range(4 * shift, 4 * shift + 4))
+            if 6 * best[0] >= min(10 * LEAST_SECONDS - 9, LEAST_SHARE * shorter):
+                shifts.setdefault((earlier, later), []).append(best)
+    for (earlier, later), several in sorted(shifts.items(), key=lambda pair: pair[0][::-1]):
+        # Of steps, others than the same ones may be nearer, as their moments are not the same.
+        for _, shift in sorted(several)[: -1 - _SHIFTS : -1]:
+            yield earlier, later, shift
+
+
+def _nearness(first: NDArray[np.float32], second: NDArray[np.float32], shift: int) -> float:
+    """How many rows of the second signature hardly differ from the one `shift` rows before in the first; one
+    that differs a little counts less.
+    """
+    start = max(shift, 0)
+    end = max(start, min(len(second), len(first) + shift))
+    gap = second[start:end] - first[start - shift : end - shift]
+    apart = np.einsum("ij,ij->i", gap, gap) / (REACH_METRES**2 * gap.shape[1])
+    return float(np.maximum(1 - apart, 0).sum())
 
 
 class Likeness(NamedTuple):
@@ -244,27 +264,36 @@ def likeness(first: NDArray[np.float64], second: NDArray[np.float64], fps: float
 
 def _repeated(first: NDArray[np.float64], second: NDArray[np.float64], shift: int) -> float:
     """Seconds of the second joints that are in the first, `shift` tenths of a second before or nearly so."""
+    from scipy.interpolate import CubicSpline
+
     window = min(_WINDOW, len(first), len(second))
-    here = _windows(first, window, 1)
+    # A cut or another speed moves the moments at which the frames of a source are sampled.
+    moments = np.arange(_FINE * (len(first) - 1) + 1) / _FINE
+    here = _windows(CubicSpline(np.arange(len(first)), first)(moments), window, 1, _FINE)
     there = _windows(second, window, _HOP)
     apart = np.full(len(there), np.inf)
-    for near_by in range(-_AROUND, _AROUND + 1):
-        at = _HOP * (np.arange(len(there)) - shift) + near_by
-        both = np.flatnonzero((at >= 0) & (at < len(here)))
-        far = np.linalg.norm(here[at[both]] - there[both], axis=-1).mean(axis=(1, 2))
-        apart[both] = np.minimum(apart[both], far)
+    best = _FINE * _HOP * (np.arange(len(there)) - shift)
+    for tried in (_FINE * np.arange(-_AROUND, _AROUND + 1), np.arange(1 - _FINE, _FINE)):
+        middle = best.copy()
+        for near_by in tried:
+            at = middle + near_by
+            both = np.flatnonzero((at >= 0) & (at < len(here)))
+            far = np.linalg.norm(here[at[both]] - there[both], axis=-1).mean(axis=(1, 2))
+            nearer = both[far < apart[both]]
+            apart[both] = np.minimum(apart[both], far)
+            best[nearer] = at[nearer]
     same = apart < SAME_METRES
     moves = np.ptp(there, axis=1).max(axis=(1, 2)) > STILL_METRES
     count = int(same.sum())
     return (count + window // _HOP - 1) * _HOP / _RATE if (same & moves).any() else 0.0
 
 
-def _windows(joints: NDArray[np.float64], window: int, hop: int) -> NDArray[np.float64]:
-    """Windows [n, W, N, 3] that begin every `hop` samples, each in the frame of its middle."""
-    starts = np.arange(0, len(joints) - window + 1, hop)
-    taken = joints[starts[:, None] + np.arange(window)]
+def _windows(joints: NDArray[np.float64], window: int, hop: int, step: int = 1) -> NDArray[np.float64]:
+    """Windows [n, W, N, 3] of every `step`-th sample that begin every `hop` samples, seen from each
+    pelvis in the direction of the middle.
+    """
+    starts = np.arange(0, len(joints) - step * (window - 1), hop)
+    taken = joints[starts[:, None] + step * np.arange(window)]
     middle = taken[:, window // 2]
-    plane = (ground(taken) - ground(middle)[:, :1][:, None]) * np.exp(-1j * facing(middle[:, None]))[
-        ..., None
-    ]
+    plane = (ground(taken) - ground(taken)[:, :, :1]) * np.exp(-1j * facing(middle[:, None]))[..., None]
     return np.stack([plane.imag, taken[..., 1], plane.real], axis=-1)

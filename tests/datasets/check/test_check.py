@@ -23,7 +23,7 @@ from motionloom.datasets.check import dataset
 from motionloom.datasets.check.dataset import CheckReport, check_once, examine
 from motionloom.datasets.check.findings import LISTED, Findings
 from motionloom.datasets.check.leaks import find_leaks
-from motionloom.datasets.motion.canonical import canonicalize, mirror
+from motionloom.datasets.motion.canonical import canonicalize, mirror, resample
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.shards import sample as sample_module
 from motionloom.datasets.shards import tar as shards
@@ -150,6 +150,24 @@ def test_a_mirror_image_that_does_not_say_so(tmp_path: Path) -> None:
     assert sorted(named) == [[("b2", "b")], [("image", "a")]]
     same_split = report_on(tmp_path / "same", Made("a"), Made("image", "train", image))
     assert (same_split.errors, same_split.warnings) == ([], [])
+
+
+@pytest.mark.parametrize("how", ["1 frame", "3 frames", "15 frames", "2 % slower", "noise"])
+def test_a_copy_that_was_changed(tmp_path: Path, how: str) -> None:
+    """Of four figures at 60 fps, before they are resampled."""
+    clips = []
+    for seed in range(4):
+        joints = walk(seed, 480)
+        cut = int(how.split()[0]) if "frame" in how else 0
+        copy = joints[cut:]
+        if how == "noise":
+            copy = copy + np.random.default_rng(9).normal(0, 5e-4, copy.shape)
+        both = resample(joints, 60.0, 20.0), resample(copy, 60.0 / 1.02 if "%" in how else 60.0, 20.0)
+        one, other = (encode(canonicalize(figure), LAYOUT) for figure in both)
+        clips += [Made(f"a{seed}", motion=one), Made(f"b{seed}", "test", other)]
+    errors = report_on(tmp_path, *clips).errors
+    named = {tuple(re.findall(r"'([ab]\d)'", str(error))[-2:]) for error in errors}
+    assert {tuple(sorted(pair)) for pair in named} == {(f"a{seed}", f"b{seed}") for seed in range(4)}
 
 
 def test_mirror_images_stay_in_the_split_of_their_family(tmp_path: Path) -> None:
