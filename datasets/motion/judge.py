@@ -267,8 +267,8 @@ def _still(body: NDArray[np.float64], fps: float) -> Iterator[Fault]:
 
 _GRAVITY = 9.81
 _USUAL = 0.54
-_LEAST_FPS = 24
-"""Steps of fewer frames a second are counted too coarsely."""
+_FINE_FPS = 24
+"""Steps of fewer frames a second are counted coarsely: one frame more or less is no fault."""
 
 
 def _swings(body: NDArray[np.float64], fps: float, height: float) -> list[float]:
@@ -326,8 +326,9 @@ def _time(body: NDArray[np.float64], fps: float, height: float) -> Iterator[Faul
         text = f"{len(again)} of {len(body)} frames repeat the one before in the midst of motion"
         yield _fault("repeated frames", text, len(again) / max(REPEATS * len(body), 2), int(again[0]) + 2)
     times = _swings(body, fps, height)
-    usual = float(np.median(times)) if len(times) >= STEPS and fps >= _LEAST_FPS else _USUAL
-    if not SWING[0] <= usual <= SWING[1]:
+    usual = float(np.median(times)) if len(times) >= STEPS else _USUAL
+    slack = 1 / fps if fps < _FINE_FPS else 0.0
+    if not SWING[0] - slack <= usual <= SWING[1] + slack:
         factor = usual / _USUAL
         text = f"steps take {factor:.1f} times as long as people's: is the frame rate right?"
         yield _fault("frame rate", text, max(factor, 1 / factor))
