@@ -31,7 +31,6 @@ from results import page, read_records
 
 from motionloom.datasets.actions.measure import agrees
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.motion.body.landing import landed
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
 from motionloom.datasets.motion.canonical import ground, heading, resample
 from motionloom.datasets.motion.easing import eased
@@ -40,6 +39,7 @@ from motionloom.datasets.synth.generate import SynthConfig, make_sample, split_o
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.editing.edit import edit_clip
 from motionloom.pipeline.editing.finish import accelerations, sliding
+from motionloom.pipeline.editing.landing import landed
 from motionloom.pipeline.editing.task import EditTask
 from motionloom.pipeline.evaluation.estimate import estimate
 from motionloom.pipeline.evaluation.truth import Truth

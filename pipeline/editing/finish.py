@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.chain_solver import solve_poses
 from motionloom.datasets.motion.body.feet import foot_contacts, plant_feet
-from motionloom.datasets.motion.body.landing import landed, reached
 from motionloom.datasets.motion.body.rigid import RigidMotion, share_twist
 from motionloom.datasets.motion.bvh.own_file import OwnBvh
 from motionloom.datasets.motion.canonical import facing, ground, retarget
@@ -23,6 +22,7 @@ from motionloom.datasets.motion.kinematics import forward_kinematics, joints_to_
 from motionloom.datasets.motion.layout import PIECES, piece_joints
 from motionloom.models.metrics.dance import ANKLES_TOES
 from motionloom.pipeline.editing.frames import WALKS, EditFrames
+from motionloom.pipeline.editing.landing import landed, reached
 from motionloom.pipeline.editing.own_file import between_rows, own_rows, with_made
 from motionloom.pipeline.editing.task import EditReport
 from motionloom.pipeline.editing.timed import RootPath

@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from motionloom.datasets.loading.dances import joints_of_dance
 from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.smpl75 import fit_smpl75
 from motionloom.datasets.motion.layout import Part
 from motionloom.pipeline.baselines.bailando.codes import DanceVq
+from motionloom.pipeline.baselines.bailando.dances import joints_of_dance
 from motionloom.pipeline.baselines.bailando.network import CrossGpt
 from motionloom.pipeline.contract.generation import Capabilities, GenerationRequest
 from motionloom.pipeline.inference.generators.base import DanceGenerator

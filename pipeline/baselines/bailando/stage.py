@@ -12,12 +12,12 @@ from pydantic import Field
 from torch.utils.data import Dataset
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.loading.dances import BeatBatches, JointCrops, danced_joints
 from motionloom.datasets.loading.plan import Share
 from motionloom.datasets.modalities.modality import FrameStats
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.baselines.bailando.codes import DanceVq, DanceVqConfig, places
+from motionloom.pipeline.baselines.bailando.dances import BeatBatches, JointCrops, danced_joints
 from motionloom.pipeline.baselines.bailando.generator import BailandoGenerator
 from motionloom.pipeline.baselines.bailando.network import ActorCritic, CrossGpt, CrossGptConfig, RewardConfig
 from motionloom.pipeline.baselines.bailando.release import release_of_codes, release_of_gpt

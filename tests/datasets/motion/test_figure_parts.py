@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from motionloom.datasets.motion.body.landing import landed, reached
 from motionloom.datasets.motion.body.rigid import fit_rigid
 from motionloom.datasets.motion.easing import eased
 from motionloom.datasets.motion.layout import (
@@ -18,6 +17,7 @@ from motionloom.datasets.motion.layout import (
     step_columns,
 )
 from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.pipeline.editing.landing import landed, reached
 
 SIDES = ("left", "right")
 ARMS = ["left_shoulder", "left_elbow", "left_wrist"]
