@@ -268,7 +268,7 @@ def _still(body: NDArray[np.float64], fps: float) -> Iterator[Fault]:
 _GRAVITY = 9.81
 _USUAL = 0.54
 _FINE_FPS = 24
-"""Steps of fewer frames a second are counted coarsely: one frame more or less is no fault."""
+"""Steps of fewer frames a second are counted coarsely: none are too quick, a frame more is not too slow."""
 
 
 def _swings(body: NDArray[np.float64], fps: float, height: float) -> list[float]:
@@ -327,8 +327,8 @@ def _time(body: NDArray[np.float64], fps: float, height: float) -> Iterator[Faul
         yield _fault("repeated frames", text, len(again) / max(REPEATS * len(body), 2), int(again[0]) + 2)
     times = _swings(body, fps, height)
     usual = float(np.median(times)) if len(times) >= STEPS else _USUAL
-    slack = 1 / fps if fps < _FINE_FPS else 0.0
-    if not SWING[0] - slack <= usual <= SWING[1] + slack:
+    is_fine = fps >= _FINE_FPS
+    if (is_fine and usual < SWING[0]) or usual > SWING[1] + (0.0 if is_fine else 1 / fps):
         factor = usual / _USUAL
         text = f"steps take {factor:.1f} times as long as people's: is the frame rate right?"
         yield _fault("frame rate", text, max(factor, 1 / factor))
