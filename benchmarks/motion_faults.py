@@ -218,7 +218,7 @@ COPIES: dict[str, Planted] = {
     "15 frames off the start": sliced(slice(15, None)), "2 % slower": faster(1 / 1.02),
     "noise of 0.05 degrees": noisy,
 }  # fmt: skip
-"""What is made of a recording that stays the same one."""
+"""Copies of a recording that show the same motion, by what was done to it."""
 
 
 def count_copies(data: Path, count: int, folder: Path) -> None:

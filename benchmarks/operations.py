@@ -147,7 +147,7 @@ def gpt_rows(layers: int, rows: int, limit: Tensor) -> tuple[InterleavedGPT, Row
 
 
 def token(rows: int) -> Record:
-    """What one token of so many motions starts."""
+    """Return what one token of so many motions starts."""
     counts = Counted()
     fused: Counter[str] = Counter()
     kernels: dict[object, int] = {}

@@ -75,7 +75,11 @@ def execute(
         facts = facts_of(recipe, run, plan)
         if copies is not None:
             facts["the run folder"] = copies.store.place  # each machine may have its own
-        team = Team.start(recipe.hardware, facts) if together else Team()
+        team = copies.team if copies is not None else None
+        if team is not None:
+            team.agree(facts)
+        else:
+            team = Team.start(recipe.hardware, facts) if together else Team()
         send: Callable[[str], None] = _nowhere if copies is None else copies.send
         if leads and todo:
             said = doubts(recipe, run, (row.stage for row in todo))

@@ -26,7 +26,7 @@ from motionloom.datasets.base.lock import LOCK_FILE, file_lock
 from motionloom.datasets.shards.store import open_store, read_stored
 from motionloom.pipeline.contract.units import WORK
 from motionloom.pipeline.launch.console import say
-from motionloom.pipeline.launch.process import local_rank
+from motionloom.pipeline.launch.process import local_rank, process_rank
 from motionloom.pipeline.launch.team import Team
 from motionloom.pipeline.store.artifact import FILE_NAME
 from motionloom.pipeline.store.files import remove_tree
@@ -55,8 +55,8 @@ class Mirror:
         self._threads = ThreadPoolExecutor(1)
         self._due: set[str] = set()
         self._sent: dict[str, Future[None]] = {}
-        self._team = team or Team()
-        self._follows = self._team.rank >= devices and local_rank() == 0
+        self.team = team
+        self._follows = team is not None and team.rank >= devices and local_rank() == 0
 
     def __enter__(self) -> Self:
         return self
@@ -77,7 +77,7 @@ class Mirror:
     def fetch(self, stages: Sequence[str]) -> None:
         """Fetch stages that are further there than here, unless they are begun here with other settings."""
         self._run.mkdir(parents=True, exist_ok=True)
-        if self._team.leads:
+        if self.team is None or self.team.leads:
             with file_lock(self._run / LOCK_FILE):  # all processes of the machine ask for it
                 for stage in stages:
                     self._fetch(f"stages/{stage}")
@@ -85,30 +85,30 @@ class Mirror:
 
     def spread(self, stages: Sequence[str]) -> None:
         """Have all machines hold what the lead's has of some stages; all processes call it."""
-        if self._team.world == 1:
+        if self.team is None:
             return
-        if self._team.leads:
+        if self.team.leads:
             for stage in stages:
                 if (self._run / "stages" / stage / STARTED).exists():
                     self.send(stage)
             self._flush()
-        self._team.meet()
+        self.team.meet()
         if self._follows:
             for stage in stages:
                 self._follow(f"stages/{stage}")
-        self._team.meet()
+        self.team.meet()
 
     def collect(self, stage: str) -> None:
         """Have the lead's machine hold the units of a shared stage that others have made; all call it."""
-        if self._team.world == 1:
+        if self.team is None:
             return
-        self._team.meet()
+        self.team.meet()
         work = f"stages/{stage}/{WORK}/"
         if self._follows:
             for path in sorted((self._run / work).glob("*.npz")):
                 self.store.put(path, work + path.name, sha256_of(path))
-        self._team.meet()
-        if self._team.leads:
+        self.team.meet()
+        if self.team.leads:
             for name in self.store.names(work):
                 if not (self._run / work / name.removeprefix(work)).exists():
                     self.store.get(name, self._run / name)
@@ -151,7 +151,7 @@ class Mirror:
 
     def send(self, stage: str) -> None:
         """Have the state of a stage put there soon, where this process leads."""
-        if self._team.leads and stage not in self._due:
+        if process_rank() == 0 and stage not in self._due:
             self._due.add(stage)
             self._sent[stage] = self._threads.submit(self._send, stage)
 

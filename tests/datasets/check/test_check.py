@@ -154,7 +154,7 @@ def test_a_mirror_image_that_does_not_say_so(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("how", ["1 frame", "3 frames", "15 frames", "2 % slower", "noise"])
 def test_a_copy_that_was_changed(tmp_path: Path, how: str) -> None:
-    """Of four figures at 60 fps, before they are resampled."""
+    """Four figures at 60 fps, copied before they are resampled."""
     clips = []
     for seed in range(4):
         joints = walk(seed, 480)

@@ -148,7 +148,7 @@ def test_mistakes_are_named(net: Dmd) -> None:
 def test_tokens_that_belong_to_one_motion_become_that_motion(
     predicts: Any, steps: int, sampler: Sampler
 ) -> None:
-    """Of four, within 5 % of their spread; where it predicts noise 20 % in four times the steps."""
+    """Each of four, within 5 % of their spread; where it predicts noise 20 % in four times the steps."""
     torch.manual_seed(0)
     schedule = ScheduleConfig(betas="linear", predicts=predicts)
     net = Dmd(SMALL.model_copy(update={"dim": 64, "ff": 128, "schedule": schedule}), STREAMS, PATTERN, 6)
