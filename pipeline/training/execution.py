@@ -132,4 +132,7 @@ def strategy_of(hardware: Hardware, config: TrainConfig) -> str | Strategy:
         process_group_backend=hardware.backend(),
         # The quantizers keep codebooks equal themselves; rank 0's copy must not overwrite them mid-step.
         forward_sync_buffers=False,
+        # Without it torch orders its buckets anew after the first step of a process, and more than two ranks
+        # then add in another order: a resumed training would have other bytes.
+        find_unused_parameters=True,
     )
