@@ -31,6 +31,7 @@ from motionloom.datasets.convert.registry import converter_named, names
 from motionloom.datasets.shards.finish import join_parts
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, tally
 from motionloom.datasets.shards.options import Part
+from motionloom.datasets.shards.reader import load_manifest
 from motionloom.datasets.shards.staging import staged
 from motionloom.datasets.shards.store import RemoteStore
 from motionloom.pipeline.cli.options import Commands, Workers, fields_of, set_option
@@ -208,6 +209,7 @@ def convert_command(
     """Plan a conversion, or run it; `out` may stand for the bucket `store` at `place`."""
     from motionloom.datasets.convert.common.conversion import run_conversion
     from motionloom.datasets.convert.registry import converter_named, prepare
+    from motionloom.datasets.convert.repeat import Repeat
 
     converter = converter_named(kind)
     config = converter.config_class.parse(fields, f"data convert {kind}")
@@ -227,6 +229,12 @@ def convert_command(
         say(console, f"convert it: {line}" if line else "nothing of it can be converted")
         return
     require_folder(out)
+    repeat = None if part or store else Repeat(converter, config, out)
+    if repeat is not None and repeat.is_finished():
+        manifest = load_manifest(out)
+        say_manifest(manifest, out, console)
+        say(console, f"{out}: finished already, {len(manifest.shards):,} shards; nothing has changed")
+        return
     conversion = prepare(config, kind=converter, out=out, workers=workers, progress=shown, write=True)
     for line in conversion.plan.sums:
         say(console, line)
@@ -248,6 +256,8 @@ def convert_command(
     for note in manifest.notes:
         if note not in conversion.plan.notes:  # said before
             say(console, f"note: {note}")
+    if repeat is not None:
+        repeat.note()
 
 
 def proposed(

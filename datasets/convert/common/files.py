@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import os
 import stat
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -131,7 +130,7 @@ def walk(root: Path, skip: Path | None = None) -> Walk:
         folder = folders.pop() if folders else links.pop(links.index(min(links)))
         try:
             identity = _identity(root / folder)
-            entries = list(os.scandir(root / folder))
+            entries = [path.name for path in (root / folder).iterdir()]
         except OSError as error:
             found.unread[f"{folder}/"] = _reason(error)
             continue
@@ -142,17 +141,17 @@ def walk(root: Path, skip: Path | None = None) -> Walk:
             continue
         seen.add(identity)
         for entry in entries:
-            name = f"{folder}/{entry.name}" if folder else entry.name
-            if entry.name == "__MACOSX" or entry.name.startswith("._"):
+            name = f"{folder}/{entry}" if folder else entry
+            if entry == "__MACOSX" or entry.startswith("._"):
                 found.others[name] = "what a Mac puts into archives"
                 continue
             try:
-                mode = entry.stat().st_mode
+                mode = (root / name).stat().st_mode
             except OSError as error:
                 found.unread[name] = _reason(error)
                 continue
             if stat.S_ISDIR(mode):
-                (links if entry.is_symlink() else folders).append(name)
+                (links if (root / name).is_symlink() else folders).append(name)
             elif stat.S_ISREG(mode):
                 found.files.append(name)
             else:

@@ -18,6 +18,7 @@ from program import commands
 from rich.console import Console
 
 from motionloom.datasets.base.records import Manifest
+from motionloom.datasets.convert import registry
 from motionloom.datasets.shards.index import ShardIndex
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.cli.convert import say_manifest
@@ -158,6 +159,32 @@ def test_a_wrong_axis_is_seen_by_plan_conversion_and_check(tmp_path: Path, call:
     assert call("data", "check", lying).code == 1
 
 
+def test_an_unchanged_conversion_is_not_planned(
+    tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, out = tmp_path / "mocap", tmp_path / "out"
+    write_clip(source / "1.bvh", 1)
+    joint_map = write_map(tmp_path / "joint_map.json")
+    words = ("data", "convert", "bvh", source, out, "--workers", 1, "--set", f"joint_map={joint_map}")
+    planned: list[object] = []
+    plan = registry.prepare
+    monkeypatch.setattr(registry, "prepare", lambda *a, **k: planned.append(1) or plan(*a, **k))
+
+    def plans(*more: str) -> int:
+        planned.clear()
+        assert call(*words, "--licence", "CC0", *more).code == 0
+        return bool(planned)
+
+    assert plans() and not plans()
+    for changed in (source / "1.bvh", joint_map, next(out.glob("*.tar")), out / "index.npz"):
+        changed.write_bytes(changed.read_bytes())
+        assert plans() and not plans(), changed
+    write_clip(source / "sub/2.bvh", 2)
+    assert plans() and not plans() and plans("--set", "look=0")
+    next(out.glob("*.tar")).unlink()
+    assert plans("--set", "look=0") and not plans("--set", "look=0")
+
+
 def test_parts_are_planned_made_and_joined(tmp_path: Path, call: Call) -> None:
     (tmp_path / "splits").mkdir()
     for seed, split in enumerate(("train", "val", "test")):
@@ -181,8 +208,8 @@ def test_parts_are_planned_made_and_joined(tmp_path: Path, call: Call) -> None:
     assert call(*words, out, *splits, "--part", "2/2").code == 0
     assert call("data", "join", out).code == call("data", "join", out).code == 0
     assert call(*words, whole, *splits).code == 0
-    assert {path.name: path.read_bytes() for path in out.glob("*.*")} == {
-        path.name: path.read_bytes() for path in whole.glob("*.*")
+    assert {path.name: path.read_bytes() for path in out.glob("[!.]*.*")} == {
+        path.name: path.read_bytes() for path in whole.glob("[!.]*.*")
     }
 
 
