@@ -27,7 +27,7 @@ from typer.main import get_command
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError, nearest
 from motionloom.datasets.base.records import MANIFEST_FILE, Manifest
-from motionloom.datasets.convert.registry import converter_named, names
+from motionloom.datasets.convert.registry import converter_named, names, prepare
 from motionloom.datasets.shards.finish import join_parts
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, tally
 from motionloom.datasets.shards.options import Part
@@ -208,7 +208,6 @@ def convert_command(
 ) -> None:
     """Plan a conversion, or run it; `out` may stand for the bucket `store` at `place`."""
     from motionloom.datasets.convert.common.conversion import run_conversion
-    from motionloom.datasets.convert.registry import converter_named, prepare
     from motionloom.datasets.convert.repeat import Repeat
 
     converter = converter_named(kind)

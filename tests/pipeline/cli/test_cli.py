@@ -18,9 +18,9 @@ from program import commands
 from rich.console import Console
 
 from motionloom.datasets.base.records import Manifest
-from motionloom.datasets.convert import registry
 from motionloom.datasets.shards.index import ShardIndex
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
+from motionloom.pipeline.cli import convert
 from motionloom.pipeline.cli.convert import say_manifest
 from motionloom.pipeline.cli.options import plain
 
@@ -167,8 +167,8 @@ def test_an_unchanged_conversion_is_not_planned(
     joint_map = write_map(tmp_path / "joint_map.json")
     words = ("data", "convert", "bvh", source, out, "--workers", 1, "--set", f"joint_map={joint_map}")
     planned: list[object] = []
-    plan = registry.prepare
-    monkeypatch.setattr(registry, "prepare", lambda *a, **k: planned.append(1) or plan(*a, **k))
+    plan = convert.prepare
+    monkeypatch.setattr(convert, "prepare", lambda *a, **k: planned.append(1) or plan(*a, **k))
 
     def plans(*more: str) -> int:
         planned.clear()
