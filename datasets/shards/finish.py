@@ -31,7 +31,7 @@ from motionloom.datasets.base.records import (
 from motionloom.datasets.shards.card import CARD_FILE, write_card
 from motionloom.datasets.shards.columns import carry_over, drop_columns
 from motionloom.datasets.shards.index import ShardIndex, SplitIndex, index_path, save_index
-from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, write_left_out
+from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, doubtful, grouped, write_left_out
 from motionloom.datasets.shards.options import SOURCE_CHECKSUM, Part
 from motionloom.datasets.shards.sample import MEMBERS
 from motionloom.datasets.shards.staging import put, staged
@@ -181,7 +181,9 @@ def finish(out: Path, planned: Planned, results: Sequence[Result]) -> Manifest:
         where = f"; all of them: {out / LEFT_OUT_FILE}" if len(manifest.dropped) > 1 else ""
         raise UserError(f"{out}: no clip survived the conversion ({some}){where}")
     # The index is written before the manifest: whoever sees a manifest finds everything that it names.
-    splits, made_on = _finish_index(out, manifest.shards)
+    doubts: list[Dropped] = []
+    splits, made_on = _finish_index(out, manifest.shards, doubts)
+    manifest = manifest.model_copy(update={"notes": [*manifest.notes, *doubtful(doubts)]})
     columns = carry_over(out, out / OLD_FOLDER, manifest.shards)
     manifest = manifest.model_copy(update={"columns": columns})
     if len(made_on) > 1:
@@ -226,23 +228,30 @@ def _is_shard(name: str, file: str, *suffixes: str) -> bool:
     return re.fullmatch(rf"{re.escape(name)}-({'|'.join(SPLITS)})-\d{{6,}}({ends})", file) is not None
 
 
-def _finish_index(out: Path, shards: Sequence[ShardInfo]) -> tuple[Collection[SplitIndex], set[str]]:
-    """Write `index.npz`; what it holds of each split, and the kinds of processor that made the shards."""
+def _finish_index(
+    out: Path, shards: Sequence[ShardInfo], doubts: list[Dropped]
+) -> tuple[Collection[SplitIndex], set[str]]:
+    """Write `index.npz`; what it holds of each split, and the kinds of processor that made the shards.
+
+    What the judge of motion has found in the clips goes to `doubts`.
+    """
     splits: dict[Split, SplitIndex] = {}
     owners: dict[str, str] = {}
     made_on: set[str] = set()
+
+    def read(shard: ShardInfo) -> ShardIndex:
+        index = ShardIndex.load_json(index_path(out / shard.name))
+        made_on.update(index.kinds)
+        doubts.extend(index.doubts)
+        return _unique(index, shard.name, owners)
+
     for split in SPLITS:
-        splits[split] = SplitIndex.build(
-            _unique(ShardIndex.load_json(index_path(out / shard.name)), shard.name, owners, made_on)
-            for shard in shards
-            if shard.split == split
-        )
+        splits[split] = SplitIndex.build(read(shard) for shard in shards if shard.split == split)
     save_index(out, splits)
     return splits.values(), made_on
 
 
-def _unique(index: ShardIndex, shard: str, owners: dict[str, str], made_on: set[str]) -> ShardIndex:
-    made_on |= index.kinds
+def _unique(index: ShardIndex, shard: str, owners: dict[str, str]) -> ShardIndex:
     for clip in index.clips:
         if clip.id in owners:
             raise UserError(

@@ -28,6 +28,7 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
@@ -86,6 +87,8 @@ class ShardIndex(Config):
     shard: ShardInfo | None
     clips: list[ClipEntry]
     dropped: list[Dropped]
+    doubts: list[Dropped] = Field(default_factory=list)
+    """What the judge of motion has found in its clips."""
     made_on: str = ""
     """Kinds of processor on which the clips were made: last digits may differ between them."""
 

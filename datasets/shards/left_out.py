@@ -78,6 +78,12 @@ def grouped_notes(notes: Sequence[str]) -> list[str]:
     return out
 
 
+def doubtful(doubts: Iterable[Dropped]) -> list[str]:
+    """Notes on what the judge of motion has found in clips, a line for each kind."""
+    ordered = sorted(doubts, key=lambda one: one.source)
+    return [f"doubtful motion: {group}" for group in grouped(ordered)]
+
+
 def tally(dropped: Iterable[Dropped]) -> str:
     """`3 rejected, 1 unreadable file, 2 missing`, each thing counted once; empty when there is nothing."""
     sources = {(drop.kind, drop.source) for drop in dropped}

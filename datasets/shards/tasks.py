@@ -19,13 +19,13 @@ from motionloom.datasets.base.files import HashingFile, atomic_file, sha256_of_j
 from motionloom.datasets.base.json_doors import open_plain
 from motionloom.datasets.base.os_errors import of_the_machine
 from motionloom.datasets.base.randomness import permutation
-from motionloom.datasets.base.records import SPLITS, Dropped, MotionType, ShardInfo, Split
+from motionloom.datasets.base.records import SPLITS, ClipMeta, Dropped, MotionType, ShardInfo, Split
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.shards.checksums import LocalShard, require_intact
 from motionloom.datasets.shards.index import ClipEntry, ShardIndex, Written, clip_entries, index_path
 from motionloom.datasets.shards.left_out import drop
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
-from motionloom.datasets.shards.sample import DropClip, Sample, encode_sample
+from motionloom.datasets.shards.sample import DropClip, Sample, encode_sample, meta_from_json
 from motionloom.datasets.shards.store import RemoteStore
 
 T = TypeVar("T")
@@ -136,6 +136,7 @@ def write_shard(task: ShardTask[T], convert: Convert[T]) -> Result:
 
     written: list[Written] = []
     dropped: list[Dropped] = []
+    doubts: list[Dropped] = []
     made_on: set[str] = set()
     with atomic_file(task.path) as file:
         hashing = HashingFile(file)
@@ -144,12 +145,13 @@ def write_shard(task: ShardTask[T], convert: Convert[T]) -> Result:
             for item in task.items:
                 old = task.kept.get(item.made_from)
                 made_on |= _index_of(old)[0] if old else {_processor()}
-                samples = _kept(old, item.made_from) if old else _convert_item(task, convert, item)
+                samples = _kept(old, item.made_from) if old else convert_item(task, convert, item)
                 if isinstance(samples, Dropped):
                     dropped.append(samples)
                     continue
                 for clip_id, present, members in samples:
                     tar.write({"__key__": _key(task, item, clip_id), **members})
+                    doubts += doubts_of(meta_from_json(members["meta.json"], clip_id))
                     written.append(Written(clip_id, present, item.name, item.made_from))
     info = None
     # Offsets are read back from the file that lies on the disk, not from what was meant to be written.
@@ -170,6 +172,7 @@ def write_shard(task: ShardTask[T], convert: Convert[T]) -> Result:
         shard=info,
         clips=entries,
         dropped=dropped,
+        doubts=doubts,
         made_on=", ".join(sorted(made_on)),
     )
     write_json(index_path(task.path), index.dump())
@@ -226,7 +229,12 @@ def _read_index(tar: Path, changed: int) -> tuple[set[str], dict[str, list[ClipE
     return index.kinds, clips_by_origin
 
 
-def _convert_item(task: ShardTask[T], convert: Convert[T], item: ShardItem[T]) -> Encoded | Dropped:
+def doubts_of(meta: ClipMeta) -> list[Dropped]:
+    """What the judge of motion has found in a clip."""
+    return [Dropped(source=meta.source, reason=fault.text) for fault in meta.faults or ()]
+
+
+def convert_item(task: ShardTask[T], convert: Convert[T], item: ShardItem[T]) -> Encoded | Dropped:
     """Return the samples of one item, or the reason why it has none."""
     label = item.name
     try:

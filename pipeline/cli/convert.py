@@ -235,14 +235,16 @@ def convert_command(
         say(console, f"{out}: finished already, {len(manifest.shards):,} shards; nothing has changed")
         return
     conversion = prepare(config, kind=converter, out=out, workers=workers, progress=shown, write=True)
-    for line in conversion.plan.sums:
-        say(console, line)
     for note in conversion.plan.notes:
         say(console, f"note: {note}")
-    manifest = run_conversion(
-        conversion, out, workers=workers, progress=shown, part=part, store=store,
-        say=lambda line: say(console, line.replace(str(out), place or str(out))),
-    )  # fmt: skip
+    try:
+        manifest = run_conversion(
+            conversion, out, workers=workers, progress=shown, part=part, store=store,
+            say=lambda line: say(console, line.replace(str(out), place or str(out))),
+        )  # fmt: skip
+    finally:  # of what became of all, in a conversion of which too much was lost, too
+        for line in conversion.plan.sums:
+            say(console, line)
     if part is not None:
         clips = sum(shard.samples for shard in manifest.shards)
         say(

@@ -86,6 +86,9 @@ class Bvh(Converter[BvhConfig, BvhClip]):
         up = joint_map.up or self.config.up
         return SourceJoints(joints, clip.fps, mapped=True, up=up, is_sized=not joint_map.measured)
 
+    def stratum(self, clip: BvhClip) -> str:
+        return f"{super().stratum(clip)} {clip.found.skeleton}"
+
     def encode(self, clip: BvhClip, joints: NDArray[np.floating]) -> NDArray[np.float32]:
         """Features [T', D] of the joints [T, N, 3] of a clip."""
         config = self.config

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -130,10 +129,6 @@ def _read_header(data: bytes, label: str) -> tuple[int, float, str, tuple[str, .
     text, where = load_text(data, label)
     section = find_motion(text, where)
     frames = count_frames(text, section, where)
-    key = ""
-    names = tuple[str, ...]()
-    with suppress(UserError):  # a broken hierarchy is reported when the clip is converted
-        joints = parse_hierarchy(text[: section.start], where)
-        key = skeleton_key(joints.names, joints.parents)
-        names = tuple(joints.names)
-    return frames, section.fps, key, names, frames != section.frames
+    joints = parse_hierarchy(text[: section.start], where)
+    key = skeleton_key(joints.names, joints.parents)
+    return frames, section.fps, key, tuple(joints.names), frames != section.frames

@@ -2,30 +2,40 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 import operator
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Generic
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.base.records import SPLITS, Manifest, Split
+from motionloom.datasets.base.records import (
+    MANIFEST_FILE,
+    SPLITS,
+    ClipMeta,
+    Dropped,
+    Manifest,
+    MotionType,
+    Split,
+)
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
 from motionloom.datasets.convert.common.files import read_in_threads
-from motionloom.datasets.convert.common.look import Look, look_at
+from motionloom.datasets.convert.common.look import Look, look_at, sampled
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.planned import C
 from motionloom.datasets.shards.index import load_index
-from motionloom.datasets.shards.left_out import grouped_notes
+from motionloom.datasets.shards.left_out import doubtful, grouped_notes, write_left_out
 from motionloom.datasets.shards.options import SOURCE_CHECKSUM, DatasetFacts, Part, WriteOptions
 from motionloom.datasets.shards.reader import load_manifest
+from motionloom.datasets.shards.sample import meta_from_json
 from motionloom.datasets.shards.store import RemoteStore
-from motionloom.datasets.shards.tasks import plan_shards
+from motionloom.datasets.shards.tasks import ShardItem, ShardTask, convert_item, doubts_of, plan_shards
 from motionloom.datasets.shards.writer import dataset_writer
 
 _label = operator.methodcaller("label")
@@ -100,12 +110,51 @@ class Conversion(Generic[C]):
         return {"shards": len(own), "clips": sum(len(task.items) for task in own)}
 
     def looked(self) -> Conversion[C]:
-        """Itself, with a look at the source and the disk that shards will take in its plan."""
+        """Itself, with a look at the source, what becomes of a sample of its clips, and the disk that shards
+        will take in its plan.
+        """
         plan = self.plan
         plan.look = self.look()
+        clips = sampled(
+            plan.items,
+            lambda item: self.converter.stratum(item[1]),
+            self.config.look,
+            lambda item: item[1].label(),
+        )
+        notes = self.converter.copies(plan)
+        if self.config.look and clips:
+            notes += [f"tried {len(clips):,} of {len(plan.items):,} clips, as a conversion reads them"]
+            notes += self._try(clips)
+        plan.notes = grouped_notes(list(dict.fromkeys([*plan.notes, *notes])))
         width = self.config.motion_layout().dim * (2 if self.config.motion_type == "float16" else 4)
         plan.totals.bytes_needed = sum(plan.totals.frames.values()) * width + len(plan.items) * 4096
         return self
+
+    def _try(self, clips: Sequence[tuple[Split, C]]) -> list[str]:
+        """Convert clips in memory; note in the plan what becomes of them, and return what is doubted."""
+        converter = copy.copy(self.converter)
+        if hasattr(self.config, "audio_features"):  # which take seconds a minute, and refuse nothing
+            converter.config = self.config.model_copy(update={"audio_features": False})
+        work = partial(_tried, converter, self.config.motion_type)
+        how = self.settings
+        made = [*read_in_threads(work, clips, workers=how.workers, progress=how.progress)]
+        self.plan.reject([one for one in made if isinstance(one, Dropped)])
+        metas = [meta for one in made if not isinstance(one, Dropped) for meta in one]
+        self.plan.totals.measured = {meta.id: meta.frames for meta in metas}
+        return doubtful(doubt for meta in metas for doubt in doubts_of(meta))
+
+
+def _tried(
+    converter: Converter[Any, C], motion_type: MotionType, planned: tuple[Split, C]
+) -> list[ClipMeta] | Dropped:
+    """The facts of a clip's samples, or the reason why it has none."""
+    split, clip = planned
+    item = ShardItem(clip.label(), "", clip)
+    task = ShardTask(Path(), split, 0, (item,), converter.layout, motion_type, strict=False, fingerprint="")
+    made = convert_item(task, converter.convert, item)
+    if isinstance(made, Dropped):
+        return made
+    return [meta_from_json(members["meta.json"], clip_id) for clip_id, _, members in made]
 
 
 def run_conversion(
@@ -145,7 +194,13 @@ def run_conversion(
                 seen.require_people(plan.name)
                 for warning in seen.warnings:
                     say(f"warning: {warning}")
-        return writer.write(conversion.converter.convert)
+        try:
+            return writer.write(conversion.converter.convert)
+        finally:
+            if part is None and (out / MANIFEST_FILE).is_file():
+                made = Manifest.load_json(out / MANIFEST_FILE)
+                plan.reject(made.dropped[len(plan.left_out()) :])
+                write_left_out(out, [*made.dropped, *plan.not_ours])
 
 
 def moved_clips(folder: Path, plan: ConversionPlan[C]) -> str:

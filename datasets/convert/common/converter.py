@@ -118,6 +118,10 @@ class Converter(ABC, Generic[Cfg, C]):
         """Return the part of the source that a clip is in: some clips of each are looked at."""
         return str(facts_of(clip).get("subset", ""))
 
+    def stratum(self, clip: C) -> str:
+        """Return the kind of file that a clip is read from: a plan tries some of each."""
+        return f"{self.subset(clip)} {facts_of(clip).get('fps', '')}"
+
     def meta(
         self,
         clip: C,

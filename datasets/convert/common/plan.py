@@ -70,6 +70,8 @@ class Totals:
     hours: float = 0.0
     frames: dict[Split, int] = field(default_factory=dict)
     """Expected frames a split, at the target frame rate."""
+    measured: dict[str, int] = field(default_factory=dict)
+    """The frames of clips that were converted to see what becomes of them, by their ids."""
     licences: dict[str, int] = field(default_factory=dict)
     """Clips to convert under each licence."""
     bytes_needed: int | None = None
@@ -107,8 +109,8 @@ class ConversionPlan(Generic[C]):
     not_ours: list[Dropped] = field(default_factory=list)
     """Entries that are not read and lines that say nothing of a clip: for the list of what is left out."""
     notes: list[str] = field(default_factory=list)
-    sums: list[str] = field(default_factory=list)
-    """Entries of the source, and lines of each list, by what became of them."""
+    bins: dict[str, dict[str, str]] = field(default_factory=dict)
+    """What becomes of each entry of the source, and of each line of a list: a key of `_BINS`."""
     stated: str = ""
     """Numbers that the makers of the source state, and where."""
     base: str = ""
@@ -192,9 +194,9 @@ class ConversionPlan(Generic[C]):
         """Leave out a clip that was meant to become a sample, and cannot."""
         self._leave(clip.label(), reason, "rejected", file_of(clip), clip.id)
 
-    def mark_unreadable(self, source: str, error: Exception) -> None:
-        """Leave out what cannot be read."""
-        self._leave(source, drop(source, error).reason, "unreadable")
+    def mark_unreadable(self, source: str, error: Exception, *names: str) -> None:
+        """Leave out what cannot be read, and what is known by these further names."""
+        self._leave(source, drop(source, error).reason, "unreadable", *names)
 
     def _leave(self, source: str, reason: str, fate: Fate, *names: str) -> None:
         kind = fate if fate == "unreadable" or fate == "missing" else "rejected"
@@ -246,7 +248,7 @@ class ConversionPlan(Generic[C]):
         def count() -> None:
             totals.frames = dict.fromkeys(SPLITS, 0)
             for split, clip in self.items:
-                totals.frames[split] += frames(clip)
+                totals.frames[split] += totals.measured.get(clip.id) or frames(clip)
             totals.licences = dict(sorted(Counter(licence(clip) for _, clip in self.items).items()))
 
         totals.count = count
@@ -266,53 +268,74 @@ class ConversionPlan(Generic[C]):
         # A file beside the clips that is of no use to any of them is still a file that was read.
         read = self.known.beside | _given(self.config, walked)
         homes = {_home(name) for name in (*clips, *fates, *limited)}
-        bins: Counter[str] = Counter()
+        bins = self.bins.setdefault("entries of the source", {})
         entries = dict.fromkeys(walked.files, "") | walked.unread | walked.others
         for name, reason in entries.items():
             if name in clips:
-                bins["clip"] += 1
+                bins[name] = "clip"
             elif name in fates or name in limited:
-                bins["missing" if fates.get(name) == "missing" else "left out"] += 1
+                bins[name] = "missing" if fates.get(name) == "missing" else "left out"
             elif name in walked.unread:
-                bins["missing"] += 1
+                bins[name] = "missing"
                 self.mark_missing(name, reason)
             elif not reason and (name in read or name.lower().endswith(beside or ("\0",))):
-                bins["beside"] += 1
+                bins[name] = "beside"
             elif not reason and _home(name) in homes and not PurePosixPath(name).name.startswith("."):
-                bins["left out"] += 1
+                bins[name] = "left out"
                 self.skip(name.removeprefix(base), "nothing in the lists of the source names it")
             else:
-                bins["not ours"] += 1
+                bins[name] = "not ours"
                 self.not_ours.append(Dropped(source=name, reason=reason or "not read", kind="not ours"))
-        self._say("entries of the source", bins)
         self._account_lines()
 
     def _account_lines(self) -> None:
         """Put every line of the lists into one bin: that of its clip, unless it says nothing of one."""
         clips = {name: clip for _, clip in self.items for name in (clip.id, file_of(clip))}
         fates = {name: one.fate for one in self.not_taken for name in one.names}
-        bins: dict[str, Counter[str]] = {}
         for line in self.known.lines:
-            counts = bins.setdefault(line.place.rpartition(":")[0], Counter())
+            bins = self.bins.setdefault(_list_of(line), {})
             clip = clips.get(line.key)
             reason = line.reason
             if clip is not None and line.words and not reason and not line.words & words_of(clip):
                 reason = "none of its captions is of the clip's time"
             is_known = line.key in self.known.limited or fates.get(line.key, "missing") != "missing"
             if reason or (clip is None and is_known):
-                counts["left out"] += 1
+                bins[line.place] = "left out"
                 reason = reason or f"its clip {line.key} is left out"
                 self.not_ours.append(Dropped(source=line.place, reason=reason))
             elif clip is not None:
-                counts["clip"] += 1
+                bins[line.place] = "clip"
             else:
-                counts["not ours" if line.is_catalogue else "missing"] += 1
-        for name, counts in bins.items():
-            self._say(f"lines of {name}", counts)
+                bins[line.place] = "not ours" if line.is_catalogue else "missing"
 
-    def _say(self, what: str, bins: Counter[str]) -> None:
-        parts = ", ".join(f"{bins[key]:,} {words}" for key, words in _BINS.items() if bins[key])
-        self.sums.append(f"{bins.total():,} {what}: {parts or 'none'}")
+    @property
+    def sums(self) -> list[str]:
+        """Entries of the source, and lines of each list, by what became of them."""
+        sums = []
+        for what, bins in self.bins.items():
+            counts = Counter(bins.values())
+            parts = ", ".join(f"{counts[key]:,} {words}" for key, words in _BINS.items() if counts[key])
+            sums.append(f"{counts.total():,} {what}: {parts or 'none'}")
+        return sums
+
+    def reject(self, failed: Iterable[Dropped]) -> None:
+        """Move clips that could not be converted, with the entries and lines that name them, to what is left
+        out.
+        """
+        reasons = {one.source: one.reason for one in failed}
+        lost = [clip for _, clip in self.items if clip.label() in reasons]
+        self.items = [item for item in self.items if item[1].label() not in reasons]
+        kept = {name for _, clip in self.items for name in (clip.id, file_of(clip))}
+        names = {name for clip in lost for name in (clip.id, file_of(clip))} - kept
+        for clip in lost:
+            self.mark_rejected(clip, reasons[clip.label()])
+        for name in names & {file_of(clip) for clip in lost}:
+            self.bins.get("entries of the source", {}).update({self.base + name: "left out"})
+        for line in self.known.lines:
+            if line.key in names and self.bins[_list_of(line)].get(line.place) == "clip":
+                self.bins[_list_of(line)][line.place] = "left out"
+                self.not_ours.append(Dropped(source=line.place, reason=f"its clip {line.key} is left out"))
+        self.totals.count()
 
     def leave_removed(self, gone: Callable[[str, str], bool], record: str) -> None:
         """Take out what is removed, by id and label, and all that names it; `record` is named in the note."""
@@ -366,6 +389,11 @@ class ConversionPlan(Generic[C]):
     def require_settled(self) -> None:
         if self.stop:
             raise UserError(self.stop)
+
+
+def _list_of(line: ListLine) -> str:
+    """The words for the lines of a list in the sums."""
+    return f"lines of {line.place.rpartition(':')[0]}"
 
 
 def _given(config: ConvertConfig, walked: Walk) -> set[str]:

@@ -8,6 +8,7 @@ joints to samples is decided here, alike for all sets. A plan reads lists and he
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -182,12 +183,15 @@ class Release(Converter[Cfg, ReleaseClip]):
         if not entries:
             raise UserError(f"{config.source}: the lists of {self.title} name no clip in it")
         # Several clips may lie in one file: its header is read once.
-        files = list(dict.fromkeys(entry.file for entry in entries))
+        ids: dict[str, list[str]] = {}
+        for entry in entries:
+            ids.setdefault(entry.file, []).append(entry.id)
+        files = list(ids)
         found = read_in_threads(self._scan, files, workers=settings.workers, progress=settings.progress)
         scanned = dict(zip(files, found, strict=True))
         for file, state in scanned.items():
             if isinstance(state, Exception):
-                draft.mark_unreadable(file, state)
+                draft.mark_unreadable(file, state, *ids[file])
         named = {entry.id for entry in entries}
         for clip_id, split in (self.listed or {}).items():
             if clip_id not in named:
@@ -284,9 +288,13 @@ class Release(Converter[Cfg, ReleaseClip]):
         return [clip.id, entry.file, content, clip.first, clip.last, texts, clip.licence]
 
     def copies(self, plan: ConversionPlan[ReleaseClip]) -> list[str]:
+        sizes = {clip.file: self.path_of(clip.file).stat().st_size for _, clip in plan.items}
+        counts = Counter(sizes.values())
         first: dict[tuple[str, int, int], str] = {}
         notes = []
         for _, clip in plan.items:
+            if counts[sizes[clip.file]] < 2:  # nothing has its bytes: a plan need not read them
+                continue
             key = (content_of(self.path_of(clip.file)), clip.first, clip.last)
             same = first.setdefault(key, clip.file)
             if same != clip.file:

@@ -16,9 +16,11 @@ from amass_clips import as_smplx, save, walk
 from bvh_clips import write_clip, write_source
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.printable import printable
+from motionloom.datasets.base.records import SPLITS
 from motionloom.datasets.convert.captions.collect import Captions
 from motionloom.datasets.convert.common import files
-from motionloom.datasets.convert.common.conversion import run_conversion
+from motionloom.datasets.convert.common.conversion import Conversion, run_conversion
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.planned import file_of
 from motionloom.datasets.convert.registry import converter_named, prepare
@@ -175,3 +177,33 @@ def test_spellings_that_look_alike_are_one_name(spell: Callable[[str], str], tmp
     with pytest.raises(UserError, match="no captions"):
         path.write_text("name,caption\n")
         Captions.read([path])
+
+
+@pytest.mark.parametrize("name", ["bvh", "amass", "humanml3d", "motionx", "aistpp", *SETS])
+def test_a_plan_is_the_conversion(name: str, shared: Path, tmp_path: Path) -> None:
+    """Sums, clips left out with their reasons, frames and doubts, of a source with a damaged file."""
+    source = built(name, tmp_path / "source", shared)
+    kind = converter_named(name)
+
+    def prepared() -> Conversion[Any]:
+        given = {"source": source, "most_rejected": 1, "look": 1, **OPTIONS.get(name, {})}
+        return prepare(kind.config_class.parse(given, name))
+
+    before = prepared().plan
+    path = source / before.base / file_of(before.items[0][1])
+    data = path.read_bytes()
+    middle = 2 * len(data) // 3  # of the values, not of the header
+    damaged = len({file_of(clip) for _, clip in before.items}) > 1
+    if damaged:
+        path.write_bytes(data[:middle] + b"\xff" * 16 + data[middle + 16 :])
+    plan = prepared().looked().plan
+    made = prepared()
+    manifest = run_conversion(made, tmp_path / "out", progress=False)
+    assert plan.sums == made.plan.sums
+    listed = [line.split("\t") for line in (tmp_path / "out/left-out.txt").read_text().splitlines()]
+    told = {(one.kind, printable(one.source), printable(one.reason)) for one in
+            (*plan.left_out(), *plan.not_ours)}  # fmt: skip
+    assert told == set(map(tuple, listed)) and len(plan.left_out()) >= damaged
+    frames = {split: sum(one.frames for one in manifest.shards if one.split == split) for split in SPLITS}
+    assert plan.totals.frames == frames
+    assert set(manifest.notes) <= set(plan.notes)
