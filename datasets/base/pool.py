@@ -76,7 +76,7 @@ class Workers:
                 }
             for future in as_completed(futures):
                 yield futures.pop(future), future.result()  # results may be large: none is kept
-        except BrokenProcessPool:
+        except (BrokenProcessPool, BrokenPipeError):  # the latter where one died as it started
             raise UserError(
                 "a conversion worker was killed (out of memory?); run again with fewer workers: "
                 "finished work is kept"
