@@ -126,11 +126,16 @@ def _fit(
     aims = bones * np.linalg.norm(rest, axis=-1).reshape(-1, *(1,) * (bones.ndim - 2))
     moment = np.einsum("ic...,cj->...ij", aims, rest)
     moment += _PRIOR * np.square(rest).sum() * np.moveaxis(above, (0, 1), (-2, -1))
+    return np.moveaxis(nearest_rotations(moment), (-2, -1), (0, 1))
+
+
+def nearest_rotations(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rotations nearest to matrices [..., 3, 3], by least squares."""
     # Orthogonal Procrustes by numpy: `roma.special_procrustes` takes 40 ms a call, whatever the batch. An SVD
-    # stays exact where bones lie in one line and the prior decides the twist.
-    left, _, right = np.linalg.svd(moment)
+    # stays exact where bones lie in one line and a prior decides the twist.
+    left, _, right = np.linalg.svd(matrices)
     left[..., 2] *= np.linalg.det(left @ right)[..., None]
-    return np.moveaxis(left @ right, (-2, -1), (0, 1))
+    return np.asarray(left @ right)
 
 
 def _axes_last(matrices: NDArray[np.floating]) -> NDArray[np.float64]:

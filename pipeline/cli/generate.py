@@ -11,7 +11,7 @@ import typer
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.cli.motions import formats_of, print_note, write_files
-from motionloom.pipeline.cli.options import At, Device, ModelFolder, Settings, settings_of
+from motionloom.pipeline.cli.options import At, Device, ModelFolder, Rig, Settings, settings_of
 from motionloom.pipeline.inference.files.writers import figure_keys, figure_options, formats_help
 from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.store.files import require_folder
@@ -41,6 +41,7 @@ def generate(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path("motions"),
     formats: Annotated[str | None, typer.Option("--format", "-f", help=formats_help())] = None,
     seconds: Annotated[float | None, typer.Option(help="Length; default: the model decides.")] = None,
+    rig: Rig = None,
     seed: Annotated[int, typer.Option(help="Same seed, captions and options: same motions.")] = 0,
     settings: Settings = None,
     at: At = None,
@@ -74,7 +75,9 @@ def generate(
     fields, figure, more = settings_of(
         settings, SamplingConfig.model_fields, figure_keys(), ("face", "seed_motion")
     )
-    wanted = formats_of(formats)
+    if rig is not None:
+        figure["rig"] = rig
+    wanted = formats_of(formats, figure)
     posing = figure_options(figure, wanted)
     face = more.get("face")
     begun = more.get("seed_motion")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,12 +15,12 @@ if TYPE_CHECKING:
     from motionloom.pipeline.inference.motion import GeneratedMotion
 
 
-def formats_of(formats: str | None) -> list[str]:
-    """The formats of `--format`, in its words; the default ones without."""
+def formats_of(formats: str | None, options: Collection[str] = ()) -> list[str]:
+    """The formats of `--format`, in its words; without, the default ones and those that options are of."""
     from motionloom.pipeline.inference.files.outputs import require_formats
 
     if formats is None:
-        return default_formats()
+        return default_formats(options)
     wanted = [name.strip() for name in formats.split(",") if name.strip()]
     require_formats(wanted)
     return wanted

@@ -49,6 +49,7 @@ At = Annotated[
 Device = Annotated[
     str, typer.Option(help="auto (a GPU if there is one; stages go by the recipe), cpu, cuda or cuda:N.")
 ]
+Rig = Annotated[Path | None, typer.Option(help="Your own character, a .vrm or .glb, as --set rig=FILE.")]
 Workers = Annotated[int, typer.Option(help="Processes; the shards are the same bytes for any number.")]
 
 

@@ -10,7 +10,7 @@ import typer
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.register import register
 from motionloom.pipeline.cli.motions import formats_of, print_note, write_files
-from motionloom.pipeline.cli.options import Device, ModelFolder, Settings, settings_of
+from motionloom.pipeline.cli.options import Device, ModelFolder, Rig, Settings, settings_of
 from motionloom.pipeline.contract.command import Command
 from motionloom.pipeline.inference.files.writers import figure_keys, figure_options, formats_help
 from motionloom.pipeline.launch.console import make_console, say
@@ -28,6 +28,7 @@ def edit(
     samples: Annotated[int, typer.Option(min=1, help="Results.")] = 1,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path("edited"),
     formats: Annotated[str | None, typer.Option("--format", "-f", help=formats_help())] = None,
+    rig: Rig = None,
     seed: Annotated[int, typer.Option(help="Same seed, clip and options: same motions.")] = 0,
     settings: Settings = None,
     device: Device = "auto",
@@ -61,7 +62,9 @@ def edit(
     if caption is not None:
         fields["caption"] = caption
     edits = EditTask.parse(fields, "task" if task is None else str(task))
-    wanted = formats_of(formats)
+    if rig is not None:
+        figure["rig"] = rig
+    wanted = formats_of(formats, figure)
     posing = figure_options(figure, wanted)
     require_folder(out)
     aside = make_console(aside=True)  # standard output is the list of files

@@ -19,7 +19,7 @@ from motionloom.datasets.motion.bvh.motion import BvhMotion, channel_columns, re
 from motionloom.datasets.motion.bvh.own_file import OwnBvh
 from motionloom.datasets.motion.bvh.text import Floats, find_motion
 from motionloom.datasets.motion.easing import between_known, smooth
-from motionloom.datasets.motion.kinematics import forward_kinematics
+from motionloom.datasets.motion.kinematics import forward_kinematics, nearest_rotations
 
 _FADE = 0.25
 """Seconds in which made joints leave the file's, from which the model's figure is millimetres away; more
@@ -235,9 +235,7 @@ def _fit(bones: Floats, aims: Floats) -> Floats:
     """The rotations [R, 3, 3], as small as can be, that take bones [R, C, 3] nearest to where they aim."""
     moment = np.einsum("tci,tcj->tij", aims, bones)
     moment += (_PRIOR * np.square(bones).sum(axis=(1, 2)) + 1e-12)[:, None, None] * np.eye(3)
-    left, _, right = np.linalg.svd(moment)
-    left[..., 2] *= np.linalg.det(left @ right)[:, None]
-    return np.asarray(left @ right)
+    return nearest_rotations(moment)
 
 
 def _write_angles(

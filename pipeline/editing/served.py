@@ -86,7 +86,7 @@ class Clips:
             raise UserError(f"{CLIP}: empty (0 bytes)")
         kind = next((ending for first, ending in _KINDS.items() if data.startswith(first)), ".bvh")
         if kind == ".bvh" and b"HIERARCHY" not in data[:_HEAD].replace(b"\0", b"").upper():
-            raise UserError(f"{CLIP}: no motion; send a BVH, or a GLB or npz that was made here")
+            raise UserError(f"{CLIP}: no motion; send a BVH, a GLB, or an npz that was made here")
         with temporary_folder() as folder:
             path = folder / f"clip{kind}"
             path.write_bytes(data)

@@ -1,10 +1,11 @@
-"""Read a clip from one file: BVH and AMC of any human skeleton, SMPL parameters as AMASS has them (npz), and
-the npz and GLB files that are written here.
+"""Read a clip from one file: BVH and AMC of any human skeleton, SMPL parameters as AMASS has them (npz), the
+npz and GLB files that are written here, and what a `ClipReader` reads.
 """
 
 from __future__ import annotations
 
 from codecs import BOM_UTF8
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.json_doors import number, parse_json
 from motionloom.datasets.base.records import FACE, HANDS
+from motionloom.datasets.base.register import Table, discover, register
 from motionloom.datasets.convert.amass.smpl_npz import read_motion as read_smpl
 from motionloom.datasets.convert.amass.smpl_npz import read_motion_header
 from motionloom.datasets.convert.bvh.joint_guess import guess_joint_map
@@ -34,7 +36,6 @@ from motionloom.datasets.motion.layout import BODY_JOINTS, FACE_DIMS, MotionLayo
 from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.motion.skeleton import Skeleton
 
-ENDINGS = (".bvh", ".amc", ".npz", ".glb")
 _FIGURE = ("rotations", "offsets", "root")
 _SAME_MM = 0.1
 """Millimetres within which an npz's joints are those of its figure: both are rounded to float32."""
@@ -72,24 +73,28 @@ class RecordedClip:
         return len(self.joints) / self.fps
 
 
+@dataclass(frozen=True)
+class ClipReader:
+    """Reads the files of one ending as clips."""
+
+    name: str
+    """The ending."""
+    read: Callable[[Path], RecordedClip]
+    """`UserError` for what is no clip."""
+
+
+CLIP_READERS: Table[ClipReader] = Table(ClipReader, "reader of clips")
+
+
 def read_clip(path: Path) -> RecordedClip:
     """The clip of a file. `UserError` for what is no clip of a person, or too short."""
+    discover()
     ending = path.suffix.lower()
-    if ending not in ENDINGS:
-        raise UserError(f"{path}: a clip is a file that ends in {', '.join(ENDINGS)}")
-    if not path.is_file():
+    if ending not in CLIP_READERS:
+        raise UserError(f"{path}: a clip is a file that ends in {', '.join(CLIP_READERS)}")
+    if not path.is_file() and not path.parent.is_file():  # a clip may be one of several in a file
         raise UserError(f"{path}: no such file")
-    if ending == ".bvh":
-        return require_clip(_read_bvh(path))
-    if ending == ".amc":
-        motion = read_motion(read_file(path, str(path)), str(path))
-        return require_clip(_mapped(path, motion)[0])
-    if ending == ".npz":
-        return require_clip(_read_npz(path))
-    from motionloom.pipeline.render.body.glb import read_glb
-
-    figure, fps, name = read_glb(path)
-    return require_clip(RecordedClip(str(path), figure.joints, fps, None, name, figure=figure))
+    return require_clip(CLIP_READERS[ending].read(path))
 
 
 def require_clip(clip: RecordedClip) -> RecordedClip:
@@ -143,6 +148,10 @@ def _read_bvh(path: Path) -> RecordedClip:
     return replace(clip, bvh=own)
 
 
+def _read_amc(path: Path) -> RecordedClip:
+    return _mapped(path, read_motion(read_file(path, str(path)), str(path)))[0]
+
+
 def _mapped(path: Path, motion: BvhMotion) -> tuple[RecordedClip, JointMap, Unit, Up, int]:
     """The clip of a motion whose joints have known names, how they are read, and the added frames."""
     guesses = [guess_joint_map(motion, Skeleton.named(name)) for name in ("smplx52", "smpl22")]
@@ -157,6 +166,18 @@ def _mapped(path: Path, motion: BvhMotion) -> tuple[RecordedClip, JointMap, Unit
     source = joint_map.figure(replace(motion, values=motion.values[added:]), unit=unit, up=up)
     clip = RecordedClip(str(path), source.joints, motion.fps, posed=carried(source, joint_map.target))
     return clip, joint_map, unit, up, added
+
+
+def _read_glb(path: Path) -> RecordedClip:
+    from motionloom.pipeline.render.body.glb import read_glb
+
+    try:
+        figure, fps, name = read_glb(path)
+    except UserError:
+        if ".vrm" not in CLIP_READERS:
+            raise
+        return CLIP_READERS[".vrm"].read(path)  # any character's file
+    return RecordedClip(str(path), figure.joints, fps, None, name, figure=figure)
 
 
 def _read_npz(path: Path) -> RecordedClip:
@@ -206,3 +227,7 @@ def _figure_of(joints: Floats, rotations: Floats, offsets: Floats, root: Floats)
         return None  # those of a last joint turn nothing, and so may be anything
     figure = RigidMotion.posed(with_offsets(skeleton, offsets), rotations, root, joints)
     return replace(figure, joints=joints) if figure.error.max_mm < _SAME_MM else None
+
+
+for _ending, _read in {".bvh": _read_bvh, ".amc": _read_amc, ".npz": _read_npz, ".glb": _read_glb}.items():
+    register(ClipReader(_ending, _read))

@@ -17,7 +17,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.motion.body.rigid import RigidMotion
 from motionloom.datasets.motion.bvh.motion import write_bvh
+from motionloom.datasets.motion.kinematics import forward_kinematics
+from motionloom.pipeline.inference.clip_file import LEAST_FRAMES, RecordedClip
 from motionloom.pipeline.rigs.gltf import Gltf
 from motionloom.pipeline.rigs.rig import Rig
 
@@ -39,11 +42,17 @@ def clips_in(path: Path) -> dict[str, str]:
         return {f"{path.name}/00-{SUFFIX}": ""}
     out = {}
     for number, animation in enumerate(animations):
-        name = str(animation.get("name") or "")[:200]
-        words = re.sub(r"(?<=[a-z])(?=[A-Z])|[_|.]+", " ", name).strip()
-        plain = re.sub(r"[^0-9A-Za-z]+", "-", name)[:40].strip("-")
-        out[f"{path.name}/{number:02d}-{plain}{SUFFIX}"] = words
+        plain = re.sub(r"[^0-9A-Za-z]+", "-", _name(animation))[:40].strip("-")
+        out[f"{path.name}/{number:02d}-{plain}{SUFFIX}"] = _words(animation)
     return out
+
+
+def _name(animation: dict[str, Any]) -> str:
+    return str(animation.get("name") or "")[:200]
+
+
+def _words(animation: dict[str, Any]) -> str:
+    return re.sub(r"(?<=[a-z])(?=[A-Z])|[_|.]+", " ", _name(animation)).strip()
 
 
 @lru_cache(maxsize=4)
@@ -67,15 +76,51 @@ def read_animation(path: Path, label: str) -> bytes:
     except OSError as error:
         raise UserError(f"{label}: cannot be read ({error.strerror})") from None
     rig = _rig(path.parent, about.st_mtime_ns, about.st_size)
-    number = int(re.match(r"\d+", path.name)[0]) if re.match(r"\d+", path.name) else -1  # type: ignore[index]
-    animations = _animations(rig.gltf)
-    if not 0 <= number < len(animations):
-        raise UserError(f"{label}: {path.parent.name} has {len(animations)} animations")
-    turns, places, fps = _played(rig, animations[number], label)
-    rotations, root = _ours(rig, turns, places)
+    rotations, root, fps = _posed(rig, _number(path), label)
     with tempfile.TemporaryDirectory() as folder:
         write_bvh(Path(folder) / "clip.bvh", rig.skeleton, rotations, root, fps)
         return (Path(folder) / "clip.bvh").read_bytes()
+
+
+def read_character(path: Path) -> RecordedClip:
+    """The first animation of a character's file that is long enough for a clip; or the one that a name as of
+    `clips_in` says.
+    """
+    named = path.suffix.lower() == SUFFIX
+    file = path.parent if named else path
+    rig = Rig.read(file)
+    animations = _animations(rig.gltf)
+    if not animations:
+        raise UserError(f"{path}: a character without an animation; give a file that has one")
+    numbers = [_number(path)] if named else range(len(animations))
+    for number in numbers:
+        try:
+            rotations, root, fps = _posed(rig, number, str(path))
+        except UserError:
+            if number == numbers[-1]:
+                raise
+            continue
+        if len(root) >= LEAST_FRAMES:
+            break
+    own = rig.skeleton
+    joints, _ = forward_kinematics(rotations, root, own.offsets, own.parents)
+    figure = RigidMotion.posed(own, rotations, root, joints)
+    return RecordedClip(str(path), joints, fps, None, _words(animations[number]), figure=figure)
+
+
+def _number(path: Path) -> int:
+    """Which animation a clip's name says; -1 for none."""
+    found = re.match(r"\d+", path.name)
+    return int(found[0]) if found else -1
+
+
+def _posed(rig: Rig, number: int, label: str) -> tuple[Floats, Floats, float]:
+    """Local rotations [T, J, 3, 3], root [T, 3] and frame rate of an animation on our joints."""
+    animations = _animations(rig.gltf)
+    if not 0 <= number < len(animations):
+        raise UserError(f"{label}: {Path(rig.gltf.where).name} has {len(animations)} animations")
+    turns, places, fps = _played(rig, animations[number], label)
+    return (*_ours(rig, turns, places), fps)
 
 
 def _ours(rig: Rig, turns: Floats, places: Floats) -> tuple[Floats, Floats]:

@@ -18,9 +18,12 @@ from motionloom.datasets.convert.captions.read import CaptionRow
 from motionloom.datasets.convert.common.files import walk_files
 from motionloom.datasets.convert.common.splits import hash_split, read_split_files
 from motionloom.datasets.motion.bvh.joint_map import Unit, Up
-from motionloom.pipeline.rigs.animations import ENDINGS, SUFFIX, clips_in, read_animation
+from motionloom.pipeline.inference.clip_file import ClipReader
+from motionloom.pipeline.rigs.animations import ENDINGS, SUFFIX, clips_in, read_animation, read_character
 
 READERS[SUFFIX] = read_animation
+for _ending in (".vrm", ".vrma", SUFFIX):
+    register(ClipReader(_ending, read_character))
 
 
 class GlbConfig(BvhConfig):

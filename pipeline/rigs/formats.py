@@ -27,16 +27,17 @@ def _write_page(path: Path, outputs: Outputs) -> list[str]:
 
 
 _GLB = "model/gltf-binary"
+_OPTIONS = {"rig": "your .vrm or .glb", "rig_map": "names of its joints (JSON)"}
 register(Writer("vrma", ".vrma", _GLB, "VRM animation, for any VRM character", _write_vrma))
 register(
     Writer(
         "rig", "_rig.glb", _GLB, "your own character, as GLB", _write_rig, "rig.glb",
-        options={"rig": "your .vrm or .glb", "rig_map": "names of its joints (JSON)"},
+        options=_OPTIONS,
     )
 )  # fmt: skip
 register(
     Writer(
         "rig-page", "_rig.html", "text/html; charset=utf-8", "a page with your own character (--set rig)",
-        _write_page, "rig.html", False,
+        _write_page, "rig.html", False, options=dict.fromkeys(_OPTIONS, ""),
     )
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The formats and the converter of this folder: which module registers each."""
+"""The formats, the converter and the readers of this folder: which module registers each."""
 
 from __future__ import annotations
 
@@ -7,4 +7,5 @@ from motionloom.datasets.base.register import declare
 _HERE = "motionloom.pipeline.rigs"
 
 declare("converter", {"glb": f"{_HERE}.convert"})
+declare("reader of clips", dict.fromkeys((".vrm", ".vrma", ".animation"), f"{_HERE}.convert"))
 declare("writer", dict.fromkeys(("vrma", "rig", "rig-page"), f"{_HERE}.formats"))

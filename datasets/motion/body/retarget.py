@@ -27,7 +27,12 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.chain_solver import solve_poses
 from motionloom.datasets.motion.body.resting_hands import relaxed_hands
 from motionloom.datasets.motion.body.rigid import RigidMotion, flat_foot, measured_skeleton, with_offsets
-from motionloom.datasets.motion.kinematics import forward_kinematics, joints_to_rotations, swing
+from motionloom.datasets.motion.kinematics import (
+    forward_kinematics,
+    joints_to_rotations,
+    nearest_rotations,
+    swing,
+)
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.skeleton import Skeleton
 
@@ -46,11 +51,17 @@ _BENT = 0.15
 """Sine of the angle by which an elbow must be bent, on average, to show its axis."""
 _CARRIED = ("hip", "spine1", "collar")
 _UPRIGHT = 0.7
-"""Cosine to the vertical that head and legs of a standing figure have at least."""
+"""Cosine to the vertical that the legs of a standing figure have at least; half of it is enough for neck and
+head, which may lean.
+"""
 _AHEAD = 0.3
 """Share of a foot's bone that points ahead at least in such a figure."""
 _ALONG = 0.97
 """Cosine to one of its axes of a bone that lies along it."""
+_CONVENTION = 2.8
+"""Trace of a turn by 26 degrees: a convention differs from what positions of a trunk show by less, 13 degrees
+in recordings of Bandai-Namco.
+"""
 _AXES = np.array(
     [
         np.diag(signs) @ np.eye(3)[list(order)]
@@ -235,10 +246,7 @@ def _axes_of(source: SourceFigure, own: Skeleton, seen: slice) -> tuple[Floats, 
     _, shown = forward_kinematics(joints_to_rotations(points, own), points[:, 0], own.offsets, own.parents)
     # Positions say nothing of a head: on the whole it looks where the chest does.
     shown[:, own.index("head")] = shown[:, own.index("spine3")]
-    means = np.einsum("tnji,tnjk->nik", turns, shown)
-    left, _, right = np.linalg.svd(means)
-    left[..., 2] *= np.linalg.det(left @ right)[:, None]
-    axes = left @ right
+    axes = nearest_rotations(np.einsum("tnji,tnjk->nik", turns, shown))
     # An elbow bends one way only, which shows how the upper arm is twisted.
     for side in ("left", "right"):
         arm = shoulder, elbow, wrist = [
@@ -263,7 +271,9 @@ def _axes_of(source: SourceFigure, own: Skeleton, seen: slice) -> tuple[Floats, 
             continue
         scores = np.einsum("kij,ij->k", _AXES, axes[here].sum(axis=0))
         if there[0] == here[0]:
-            axes[here] = _AXES[scores.argmax()]
+            # Positions show a trunk well: one that fits no such axes has its own (trace of a rotation).
+            if len(here) > 1 or scores.max() > _CONVENTION:
+                axes[here] = _AXES[scores.argmax()]
             continue
         both = scores[:, None] + np.einsum("kdij,ij->kd", _MIRRORED, axes[there].sum(axis=0))
         best = np.unravel_index(int(both.argmax()), both.shape)
@@ -293,15 +303,13 @@ def _stands(rest: Floats, skeleton: Skeleton) -> bool:
 
     legs = [bone(f"{side}_{joint}") for side in ("left", "right") for joint in ("knee", "ankle")]
     feet = [bone(f"{side}_foot")[2] for side in ("left", "right")]
-    upright = min(bone("head")[1], bone("neck")[1], *(-leg[1] for leg in legs))
+    upright = min(2 * bone("head")[1], 2 * bone("neck")[1], *(-leg[1] for leg in legs))
     return bool(upright > _UPRIGHT and min(feet) > _AHEAD)
 
 
 def _laid(bones: Floats, aims: Floats) -> Floats:
     """The rotation that lays bones [C, 3] over aims [C, 3], direction by direction."""
-    left, _, right = np.linalg.svd(_unit(aims.T) @ _unit(bones.T).T)
-    left[:, 2] *= np.linalg.det(left @ right)
-    return np.asarray(left @ right)
+    return nearest_rotations(_unit(aims.T) @ _unit(bones.T).T)
 
 
 def _swing(bone: Floats, aim: Floats) -> Floats:

@@ -182,8 +182,12 @@ def _leaning(points: Floats, own: Skeleton, skeleton: Skeleton) -> Skeleton:
 
 
 def flat_foot(ankle: Floats, ball: Floats, bone: Floats) -> Floats:
-    """The bone [3] from ankle to ball, as steep as between `ankle` and `ball` [T, 3] of a standing foot."""
-    low = ankle[:, 1] <= np.quantile(ankle[:, 1], _STANDS)
+    """The bone [3] from ankle to ball, as steep as between `ankle` and `ball` [T, 3] of a standing foot: one
+    whose ball is not above its ankle. The bone itself where none stands.
+    """
+    low = (ankle[:, 1] <= np.quantile(ankle[:, 1], _STANDS)) & (ball[:, 1] <= ankle[:, 1])
+    if not low.any():
+        return bone
     way = ball[low] - ankle[low]
     size = float(np.linalg.norm(bone))
     length = np.linalg.norm(way, axis=-1)

@@ -7,7 +7,7 @@ A new format is one function and its `Writer`, registered: `generate --format`, 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -241,21 +241,21 @@ for _writer in (
     register(_writer)
 
 
-def default_formats() -> list[str]:
-    """The default formats."""
-    return [name for name, writer in WRITERS.items() if writer.default]
+def default_formats(options: Collection[str] = ()) -> list[str]:
+    """The default formats, and those that take one of these options."""
+    return [name for name, writer in WRITERS.items() if writer.default or {*writer.options} & {*options}]
 
 
 def formats_help() -> str:
     """The formats in one sentence of a command's help."""
     names = []
     for name, writer in WRITERS.items():
-        options = "".join(f"; --set {option}: {words}" for option, words in writer.options.items())
+        options = "".join(f"; --set {option}: {words}" for option, words in writer.options.items() if words)
         names.append(f"{name} ({writer.help}{options})")
     return f"Comma-separated, default {','.join(default_formats())}: {', '.join(names)}."
 
 
-_MADE_BY = {"body_model": "smplx", "arkit_bases": "arkit"}
+_MADE_BY = {"body_model": ["smplx"], "arkit_bases": ["arkit"]}
 
 
 def figure_keys() -> list[str]:
@@ -267,17 +267,19 @@ def figure_keys() -> list[str]:
 
 
 def figure_options(values: Mapping[str, object], formats: Sequence[str]) -> FigureOptions:
-    """The options of `figure_keys`; `UserError` where one is of a format that is not among `formats`."""
+    """The options of `figure_keys`; `UserError` where one is of a format of which none is in `formats`."""
     from motionloom.pipeline.inference.files.display_figure import FigureOptions
 
     discover()
-    by_option = {option: name for name, writer in WRITERS.items() for option in writer.options}
-    for option, form in {**_MADE_BY, **by_option}.items():
-        if values.get(option) is not None and form not in formats:
-            raise UserError(f"{option} is what --format {form} is made by: name that format too")
-    own = {key: value for key, value in values.items() if key not in by_option}
-    more = {key: value for key, value in values.items() if key in by_option}
-    return FigureOptions.parse({**own, "more": more} if more else own, "--set")
+    more: dict[str, object] = {}
+    own: dict[str, object] = {}
+    for option, value in values.items():
+        takers = [name for name, writer in WRITERS.items() if option in writer.options]
+        forms = _MADE_BY.get(option, takers)
+        if value is not None and forms and not {*forms} & {*formats}:
+            raise UserError(f"{option} is what --format {forms[0]} is made by: name that format too")
+        (more if takers else own)[option] = value
+    return FigureOptions.parse({**own, "more": more}, "--set")
 
 
 def known_format(name: str) -> str:
