@@ -3,14 +3,15 @@
     python benchmarks/reconstruction_order.py clips.npz WORK --shards SHARDS --device cpu
     python benchmarks/reconstruction_order.py clips.npz WORK --minutes 3.3
 
-`--shards` makes clips.npz, an array file of 19 MB, where it is missing. The bodies are real (SHARDS holds
-`body133` clips), the hands synthetic: each clip's two hands take a random shape each, on the recorded
-forearms. All three tokenizers of a seed see the same windows. They train side by side in one process; on a
-GPU each step is a CUDA graph on a stream of its own. Features, losses and optimizer are the paper's: standard
-deviations averaged over each kind of column, squared error, AdamW, bf16 on a GPU. The rate is constant after
-a warm-up, so that a figure at a step does not depend on how long the training was meant to be. The test
-windows are measured at fixed steps and at the end; each figure is appended to WORK/rows.jsonl at once, so
-what was reached is kept.
+`--shards` makes clips.npz, an array file of some 20 MB, where it is missing. The bodies are real (SHARDS
+holds `body133` clips), the hands synthetic: on the recorded forearms, each takes one random shape after
+another, for about a second. All three tokenizers of a seed see the same windows. They train side by side; on
+a GPU all seeds at once, each step as a CUDA graph on a stream of its own, on a CPU seed by seed. Features,
+losses and optimizer are the paper's: standard deviations averaged over each kind of column, squared error,
+AdamW, bf16 on a GPU. The rate is constant after a warm-up, so that a figure at a step does not depend on how
+long the training was meant to be. The test windows are measured after a quarter, half and all of the steps;
+each figure is appended to WORK/rows.jsonl at once, so what was reached is kept. Started again it goes on with
+the first seed that has not finished.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import roma
 import torch
 from bench import Column, arguments, command_line, report
 from numpy.typing import NDArray
@@ -40,12 +42,14 @@ from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.features.torch_joints import torch_joints_of
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.datasets.shards.reader import ShardDataset
-from motionloom.datasets.synth.hands_and_face import shape_hand
+from motionloom.datasets.synth.actions.maths import ease
+from motionloom.datasets.synth.hands_and_face import grip_hand
 from motionloom.models.metrics.reconstruction import mpjpe
 from motionloom.models.tokenizer.body_hand import H2VQConfig
 from motionloom.models.tokenizer.module import TokenizerModule
 from motionloom.models.tokenizer.single import RvqConfig
 from motionloom.models.training.optim import OptimConfig
+from motionloom.pipeline.contract.stage import stage_kinds
 
 LAYOUT = MotionLayout.named("wholebody313", fps=20)
 WINDOW = 64
@@ -54,8 +58,8 @@ UNIT = 5e-4
 CLIPS = 1600
 """Clips of a split that are looked at."""
 ARMS = ("H2VQ", "RVQ, 3 levels", "RVQ, 3 levels, as many parameters")
-MARKS = (2500, 5000, 10000)
-"""Steps at which the test windows are measured."""
+HELD = (0.6, 1.4)
+"""Seconds for which a hand has a shape, with the way there."""
 FINGERS = {"left": (20, range(22, 37)), "right": (21, range(37, 52))}
 """Wrist and finger joints of each hand."""
 FIGURES = ("mpjpe", "body", "hands", "world")
@@ -70,9 +74,23 @@ def whole_bodies(shards: Path, split: str) -> Iterator[NDArray[np.int16]]:
         if len(motion) < WINDOW:
             continue
         t = np.arange(len(motion)) / LAYOUT.fps
-        fingers = [shape_hand(str(rng.choice(HANDS)), t, rng) for _ in FINGERS]
+        fingers = [moving_hand(t, rng) for _ in FINGERS]
         joints = canonicalize(with_resting_hands(joints_of(motion, clips.layout), fingers))
         yield np.round(joints / UNIT).astype(np.int32).astype(np.int16)
+
+
+def moving_hand(t: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+    """Local finger rotations [T, 15, 3, 3] of a hand that goes from shape to shape."""
+    made = np.zeros((len(t), 15, 3, 3))
+    begin = -HELD[1]
+    while begin < t[-1]:
+        # The first shape is there when the clip begins; each way takes a third of a second.
+        part = ease((t - begin) / 0.35)[:, None, None, None]
+        shape = grip_hand(str(rng.choice(HANDS)), t, np.ones(len(t)), rng)
+        made += part * (shape - made)
+        begin += rng.uniform(*HELD)
+    # Between two shapes the nearest rotation to their mean.
+    return roma.special_procrustes(torch.from_numpy(made)).numpy()
 
 
 def make(shards: Path, file: Path) -> None:
@@ -252,53 +270,72 @@ def write(args: argparse.Namespace, row: dict[str, Any]) -> None:
     print(json.dumps(row), flush=True)
 
 
+def marks_of(args: argparse.Namespace) -> list[int]:
+    """Steps after which the test windows are measured."""
+    return [args.steps // 4, args.steps // 2, args.steps]
+
+
 def train(args: argparse.Namespace) -> None:
-    """Train side by side until the steps or the minutes are over."""
+    """Train the seeds that have not finished, until the steps or the minutes are over."""
     begin = time.monotonic()
     args.work.mkdir(parents=True, exist_ok=True)
     data = Data(args.file, torch.device(args.device))
-    for title, motion in (("nearest training window", data.nearest()), ("mean pose", 0 * data.test)):
-        write(args, {"arm": title, "seed": 0, "step": 0, **data.errors(motion)})
-    trainings = [Training(arm, seed, data, args) for seed in args.seeds for arm in ARMS]
-    if args.device == "cuda":
+    done = read_rows(args)
+    if not done:
+        for title, motion in (("nearest training window", data.nearest()), ("mean pose", 0 * data.test)):
+            write(args, {"arm": title, "seed": 0, "step": 0, **data.errors(motion)})
+    seeds = [seed for seed in args.seeds if any((arm, args.steps, seed) not in done for arm in ARMS)]
+    # Streams of a GPU overlap; on a CPU a seed after the other can be gone on with.
+    for group in [seeds] if args.device == "cuda" else [[seed] for seed in seeds]:
+        train_group([Training(arm, seed, data, args) for seed in group for arm in ARMS], begin, args)
+
+
+def train_group(trainings: list[Training], begin: float, args: argparse.Namespace) -> None:
+    """Train side by side, and measure at the marks."""
+    for training in trainings if args.device == "cuda" else []:
+        training.capture()
+    for step in range(int(trainings[0].count), args.steps) if trainings else []:
         for training in trainings:
-            training.capture()
-    while (step := int(trainings[0].count)) < args.steps:
-        border = min(mark for mark in (*MARKS, args.steps) if mark > step)
-        for done in range(step, min(border, args.steps)):
-            for training in trainings:
-                training.step()
-            if done % 20 == 19:
-                if args.device == "cuda":
-                    torch.cuda.synchronize()
-                if time.monotonic() - begin > 60 * args.minutes:
-                    break
-        if args.device == "cuda":
+            training.step()
+        if args.device == "cuda" and step % 20 == 19:
             torch.cuda.synchronize()
-        seconds = time.monotonic() - begin
-        for training in trainings:
-            training.measure(seconds)
-        if seconds > 60 * args.minutes:
-            break
+        over = time.monotonic() - begin > 60 * args.minutes
+        if over or step + 1 in marks_of(args):
+            for training in trainings:
+                training.measure(time.monotonic() - begin)
+        if over:
+            return
+
+
+def read_rows(args: argparse.Namespace) -> dict[tuple[str, int, int], dict[str, Any]]:
+    """What was measured: (arm, step, seed) -> row; of a seed that was begun twice, the later."""
+    path = args.work / "rows.jsonl"
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    rows = [json.loads(line) for line in lines]
+    return {(row["arm"], row["step"], row["seed"]): row for row in rows}
 
 
 def table(args: argparse.Namespace) -> None:
     """Print the figures at the last mark that all trainings reached, and the course of MPJPE."""
-    lines = (args.work / "rows.jsonl").read_text(encoding="utf-8").splitlines()
     found: dict[str, dict[int, list[dict[str, Any]]]] = defaultdict(lambda: defaultdict(list))
-    for line in lines:
-        row = json.loads(line)
-        found[row["arm"]][row["step"]].append(row)
-    marks = [m for m in sorted(found[ARMS[0]]) if m in MARKS and len({len(found[a][m]) for a in ARMS}) == 1]
+    for (arm, step, _), row in sorted(read_rows(args).items()):
+        found[arm][step].append(row)
+    steps = sorted({step for arm in ARMS for step in found[arm]})
+    marks = [step for step in steps if len({len(found[arm][step]) for arm in ARMS}) == 1]
     rows = []
-    for arm, at in found.items():
+    for arm in [*(arm for arm in found if arm not in ARMS), *ARMS]:
+        at = found[arm]
         last = at.get(marks[-1]) or at[0]
         cells = {figure: [row[figure] for row in last] for figure in FIGURES}
         courses = {m: at.get(m, last) for m in marks if m in at or m == marks[-1]}
         cells |= {f"mpjpe@{m}": [row["mpjpe"] for row in of_mark] for m, of_mark in courses.items()}
-        if "bits" in last[0]:
+        out: dict[str, Any] = {"title": arm, "cells": cells}
+        if arm in ARMS:
             cells |= {"bits": [last[0]["bits"]], "parameters": [last[0]["parameters"]]}
-        rows.append({"title": arm, "cells": cells, "seeds": [row["seed"] for row in last if row["step"]]})
+            kind = "h2vq" if arm == "H2VQ" else "rvq"
+            out |= {"seeds": [row["seed"] for row in last], "code": {kind: stage_kinds()[kind].version}}
+            out["protocol"] = {key: last[0][key] for key in ("width", "depth", "batch", "lr", "device")}
+        rows.append(out)
     columns = [Column("bit/s", "bits", 0), Column("million parameters", "parameters", 2, 1e-6)]
     columns += [Column(f"MPJPE after {m:,} steps, mm", f"mpjpe@{m}") for m in marks]
     columns += [Column(title, title) for title in FIGURES[1:]]
