@@ -10,7 +10,8 @@ tokens (the paper's), and on samples. Killed and started again it goes on where 
 One motion is drawn for the caption of each validation clip, with the same seeds for all trainings, and judged
 on its joints (`motionloom.datasets.actions.measure`), which no network saw: `every` is the share of right
 attributes, `whole` that of motions with all right. TMA's recall is beside it, although L_align trains with
-TMA. Differences are paired: captions and seeds are drawn anew together (bootstrap, 95 %).
+TMA. Differences are paired, with two intervals of 95 %: captions and seeds drawn anew together (bootstrap),
+which is narrow for three seeds, and Student's t over the seeds, which knows nothing of other captions.
 """
 
 from __future__ import annotations
@@ -30,9 +31,10 @@ from motionloom.datasets.motion.features.codec import encode
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import StageCache
+from motionloom.pipeline.evaluation.estimate import estimate
 from motionloom.pipeline.evaluation.judges import Judge
 from motionloom.pipeline.evaluation.latent_metrics import LatentRow, recalls
-from motionloom.pipeline.evaluation.reference_baselines import by_nearest_caption
+from motionloom.pipeline.evaluation.reference_baselines import by_nearest_caption, by_nearest_labels
 from motionloom.pipeline.evaluation.truth import perform, truth_of
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.store.evaluator import embed_motions
@@ -92,8 +94,10 @@ def gains(arm: Counts, tokens: Counts) -> list[str]:
         some = np.ix_(rng.integers(seeds, size=seeds), rng.integers(clips, size=clips))
         drawn.append(figures(arm[some]) - figures(tokens[some]))
     ends = np.percentile(drawn, [2.5, 97.5], axis=0)
-    rows = zip(figures(arm) - figures(tokens), *ends, strict=True)
-    return [f"{found:+.1f} ({low:+.1f} to {high:+.1f})" for found, low, high in rows]
+    each = np.transpose([figures(a) - figures(b) for a, b in zip(arm, tokens, strict=True)])
+    halves = [estimate(differences).interval for differences in each]
+    rows = zip(figures(arm) - figures(tokens), *ends, halves, strict=True)
+    return [f"{found:+.1f} ({low:+.1f} to {high:+.1f}; ± {half:.1f})" for found, low, high, half in rows]
 
 
 def main() -> None:
@@ -148,11 +152,12 @@ def main() -> None:
             both = gains(counts[arm], counts["tokens"])
             rows[-1]["cells"] |= {"every_gain": both[0], "whole_gain": both[1]}
     rows.append(row("recorded", [judged([truth.joints for truth in truths])]))
-    near = kept(
-        args.work / "nearest.json",
-        lambda: judged([one.joints for one in by_nearest_caption(data.split("train"), truths)]),
-    )
-    rows.append(row("nearest training caption", [near]))
+    for by, look_up in {"labels": by_nearest_labels, "caption": by_nearest_caption}.items():
+        near = kept(
+            args.work / f"nearest_{by}.json",
+            lambda look_up=look_up: judged([one.joints for one in look_up(data.split("train"), truths)]),
+        )
+        rows.append(row(f"nearest training {by}", [near]))
     report("L_align", COLUMNS, rows, args.record)
 
 

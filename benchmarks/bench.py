@@ -78,10 +78,12 @@ def arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
 def train(
     folder: Path, stages: Mapping[str, Any], *, until: str | None = None, force: bool = False, **fields: Any
 ) -> Path:
-    """Run a recipe of these stages in `folder`, whose name it gets; finished stages are not repeated."""
+    """Run a recipe of these stages in `folder`, whose name it gets, on a GPU where there is one; finished
+    stages are not repeated.
+    """
     path = folder.parent / f"{folder.name}.yaml"
     path.parent.mkdir(parents=True, exist_ok=True)
-    hardware = {"accelerator": "cpu", "threads": torch.get_num_threads()}
+    hardware = {"threads": torch.get_num_threads()}
     path.write_text(dump_yaml({"name": folder.name, "hardware": hardware, **fields, "stages": dict(stages)}))
     select = Selection(first=until, until=until) if force else Selection(until=until)
     return run_recipe(path, folder, select=select, replace=True, console=Console())
@@ -154,6 +156,7 @@ def report(
             "command": command or f"python benchmarks/{Path(sys.argv[0]).name} {shlex.join(sys.argv[1:])}",
             "versions": {"python": platform.python_version()} | versions,
             "cpu_seconds": round(process_seconds()),
+            "device": torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU",
             "code": {kind.name: kind.version for kind in KINDS.imported()},
         }
         path.write_text(json.dumps(facts | record, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
@@ -220,10 +223,8 @@ def older_rows(record: Record) -> dict[str, str]:
         code = row.get("code", record.get("code"))
         if code is None and "seeds" in row:  # of trainings, measured before records knew their code
             out[row["title"]] = f"of commit {record.get('commit', 'unknown')}"
-        elif changed := [
-            f"{kind} {version}" for kind, version in (code or {}).items() if _version(kind) != version
-        ]:
-            out[row["title"]] = ", ".join(changed)
+        elif changed := {kind: v for kind, v in (code or {}).items() if _version(kind) != v}:
+            out[row["title"]] = ", ".join(f"{kind} {v}, now {_version(kind)}" for kind, v in changed.items())
     return out
 
 
@@ -285,7 +286,8 @@ def _protocol(record: Record) -> str:
     for title, own in each.items():
         groups[_facts({k: v for k, v in own.items() if k not in common})].append(title)
     parts = [_facts(common), *(f"{' and '.join(titles)}: {own}" for own, titles in groups.items() if own)]
-    parts.append(record.get("completed", ""))
+    device = record.get("device", "CPU")
+    parts += [record.get("completed", ""), "" if device == "CPU" else f"on {device}"]
     return f"\n\n*Measured {record.get('measured', 'now')}: {'; '.join(part for part in parts if part)}.*"
 
 
