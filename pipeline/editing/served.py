@@ -123,7 +123,7 @@ class Clips:
         lines = made.report.lines()
         facts = {"clip": name, "seed": asked.seed, "notes": list(made.remarks)}
         facts |= {"report": report, "lines": lines}
-        return answer(made, asked.format, facts, "\n".join(lines), cells)
+        return answer(made, asked.format, facts, "\n".join(lines), cells, self._config.figure)
 
 
 def _open(host: Host) -> OpenPart:

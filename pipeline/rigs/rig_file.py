@@ -16,7 +16,7 @@ def rig_of(clip: OutputClip) -> Rig:
     """The character that the user has named."""
     own = clip.options.more
     if own.get("rig") is None:
-        raise UserError("--format rig needs your character: --set rig=FILE, a .vrm or .glb")
+        raise UserError("--format rig needs your character: --rig FILE, a .vrm or .glb")
     return Rig.read(Path(str(own["rig"])), None if own.get("rig_map") is None else Path(str(own["rig_map"])))
 
 

@@ -19,7 +19,7 @@ from motionloom.pipeline.rigs.faces import face_values
 from motionloom.pipeline.rigs.gltf import Gltf
 from motionloom.pipeline.rigs.names import HUMANOID, PRESETS
 
-_OURS = {joint: bone for bone, joint in HUMANOID.items()}
+_OURS = {joint: bone for bone, joint in HUMANOID.items()} | {"spine3": "chest"}
 _EYES = (0.0, 0.06, 0.0)
 """From the head to between the eyes, metres; players that follow the gaze start from there."""
 
@@ -47,16 +47,24 @@ def write_vrma(path: Path, outputs: Outputs) -> None:
     skeleton = worn.skeleton
     frames = len(worn.root)
     lift = -float(body_for(skeleton).vertices[:, 1].min())
+    # Players drop what a character has no bone for, and many have no upper chest: the chest takes its turns.
+    low, high = skeleton.index("spine2"), skeleton.index("spine3")
+    parents = list(skeleton.parents)
+    offsets = skeleton.offsets + np.array([[0.0, lift, 0.0]] + [[0.0] * 3] * (len(skeleton) - 1))
+    rotations = worn.rotations.copy()
+    rotations[:, high] = rotations[:, low] @ rotations[:, high]
+    offsets[[child for child, parent in enumerate(parents) if parent == high]] += offsets[high]
+    offsets[high], parents[high] = offsets[low], parents[low]
+    kept = [joint for joint in range(len(skeleton)) if joint != low]
     nodes: list[dict[str, Any]] = []
-    for joint, name in enumerate(skeleton.joints):
-        place = skeleton.offsets[joint] + np.array([0.0, lift if joint == 0 else 0.0, 0.0])
-        children = [child for child, parent in enumerate(skeleton.parents) if parent == joint]
-        nodes.append({"name": _OURS[name], "translation": place.tolist()})
+    for joint in kept:
+        children = [row for row, child in enumerate(kept) if parents[child] == joint]
+        nodes.append({"name": _OURS[skeleton.joints[joint]], "translation": offsets[joint].tolist()})
         if children:
             nodes[-1]["children"] = children
-    humanoid = {"humanBones": {_OURS[name]: {"node": joint} for joint, name in enumerate(skeleton.joints)}}
-    quaternions = Rotation.from_matrix(worn.rotations.reshape(-1, 3, 3)).as_quat().reshape(frames, -1, 4)
-    tracks = {(joint, "rotation"): quaternions[:, joint] for joint in range(len(skeleton))}
+    humanoid = {"humanBones": {node["name"]: {"node": row} for row, node in enumerate(nodes)}}
+    quaternions = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_quat().reshape(frames, -1, 4)
+    tracks = {(row, "rotation"): quaternions[:, joint] for row, joint in enumerate(kept)}
     # At rest the soles are on the floor; in the motion they are where the lowest joint of a foot is.
     feet = [skeleton.index(f"{side}_foot") for side in ("left", "right")]
     sole = lift + float(skeleton.rest_joints[feet, 1].min())
@@ -73,7 +81,7 @@ def write_vrma(path: Path, outputs: Outputs) -> None:
     extension["lookAt"] = {"node": len(nodes), "offsetFromHeadBone": list(_EYES)}
     tracks[len(nodes), "rotation"] = np.array([[0.0, 0.0, 0.0, 1.0]] * frames)
     nodes.append({"name": "lookAt"})
-    roots = [0, *range(len(skeleton), len(nodes))]
+    roots = [0, *range(len(kept), len(nodes))]
     scene = {
         "asset": {"version": "2.0", "generator": "motionloom"},
         "scene": 0,

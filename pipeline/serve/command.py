@@ -8,7 +8,7 @@ import typer
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.register import register
-from motionloom.pipeline.cli.options import Device, ModelFolder, fields_of, set_option
+from motionloom.pipeline.cli.options import Device, ModelFolder, Rig, fields_of, set_option
 from motionloom.pipeline.contract.command import Command
 from motionloom.pipeline.launch.console import make_console
 
@@ -19,6 +19,7 @@ def serve(
         str, typer.Option(help="Address to listen at; others can reach all but loopback.")
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port; 0 takes a free one.")] = 8000,
+    rig: Rig = None,
     sets: Annotated[
         list[str] | None,
         set_option(
@@ -34,11 +35,14 @@ def serve(
 
     Example: `motionloom serve runs/humantomato-tiny`
 
+    Example: `motionloom serve inbetween --rig hero.vrm`
+
     Example: `motionloom serve my-model --port 0 --set max_seconds=10`
     """
     from motionloom.pipeline.serve.requests import ServeConfig
 
-    config = ServeConfig.parse({"host": host, "port": port, **fields_of(sets, "--set")}, "serve")
+    given = {"host": host, "port": port, "rig": rig, **fields_of(sets, "--set")}
+    config = ServeConfig.parse(given, "serve")
     try:
         from motionloom.pipeline.serve.server import serve as run_server
     except ModuleNotFoundError as error:

@@ -7,7 +7,8 @@ import json
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated, Generic, TypeVar
 
 import numpy as np
@@ -19,8 +20,9 @@ from motionloom.datasets.audio.sound import Sound, read_sound, sound_seconds
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import temporary_folder
-from motionloom.pipeline.inference.files.outputs import clip_of, file_stem, save
-from motionloom.pipeline.inference.files.writers import WRITERS, cell_of
+from motionloom.pipeline.inference.files.display_figure import FigureOptions
+from motionloom.pipeline.inference.files.outputs import clip_of, file_stem, page_title
+from motionloom.pipeline.inference.files.writers import WRITERS, Outputs, cell_of
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.request import Request
@@ -35,6 +37,10 @@ class ServeConfig(Config):
     """Address to listen at; anything but loopback lets others in."""
     port: int = Field(8000, ge=0, le=65535)
     """0 takes a free one."""
+    rig: Path | None = None
+    """The user's own character, for the formats `rig` and `rig-page`."""
+    rig_map: Path | None = None
+    """Names of its joints (JSON)."""
     allow_hosts: tuple[str, ...] = ()
     """Names and addresses that the server is reached by, besides localhost and `host`."""
     waiting: int = Field(32, ge=1)
@@ -59,6 +65,11 @@ class ServeConfig(Config):
     """Seconds in which the headers of a request must have arrived, and then its body."""
     connections: int = Field(256, ge=1)
     """Connections at a time; one more is answered 503."""
+
+    @property
+    def figure(self) -> FigureOptions:
+        """What figures are written by."""
+        return FigureOptions(more=self.model_dump(include={"rig", "rig_map"}, exclude_none=True))
 
     def require_small(self, texts: Iterable[str], seconds: float) -> None:
         """Refuse captions and a motion that are longer than allowed."""
@@ -170,7 +181,8 @@ class Motions:
         facts = {"clip": name, "seed": asked.seed, "face": asked.face, "notes": notes, "nearest": nearest}
         if sound is not None:
             facts["heard"] = in_words(sound)
-        return answer(motion, asked.format, facts, "\n".join(notes), {"generated": motion})
+        figure = self._config.figure
+        return answer(motion, asked.format, facts, "\n".join(notes), {"generated": motion}, figure)
 
 
 def answer(
@@ -179,15 +191,17 @@ def answer(
     facts: Mapping[str, object],
     note: str,
     cells: Mapping[str, GeneratedMotion],
+    figure: FigureOptions,
 ) -> Answer:
-    """A motion as a file of one of `WRITERS`, with the note on its page; else as JSON with `facts`: its
-    numbers, or the viewer's data of `cells`, each under its label.
+    """A motion as a file of one of `WRITERS`, by `figure`, with the note on its page; else as JSON with
+    `facts`: its numbers, or the viewer's data of `cells`, each under its label.
     """
     if form in WRITERS:
         writer = WRITERS[form]
         with temporary_folder() as folder:
             path = folder / f"motion{writer.suffix}"
-            save(path, motion, note)
+            clip = replace(clip_of(motion), options=figure)
+            writer.write(path, Outputs([clip], page_title([motion.caption]), note))
             name = f"{file_stem(motion.seed or 0, motion.caption)}{writer.suffix}"
             return Answer(path.read_bytes(), writer.mime, name)
     whole = {

@@ -193,7 +193,8 @@ def on_bones(motion: RigidMotion, offsets: NDArray[np.floating]) -> RigidMotion:
         if own.joints[joint].endswith(_LIMBS) or joint >= BODY_JOINTS:
             world[:, joint] = world[:, joint] @ _swing(skeleton.offsets[end], own.offsets[end])
     local = _local(world, np.asarray(own.parents))
-    scale = skeleton.rest_joints[feet, 1].mean() / own.rest_joints[feet, 1].mean()
+    balls = feet[:, 1]
+    scale = skeleton.rest_joints[balls, 1].mean() / own.rest_joints[balls, 1].mean()
     targets, _ = forward_kinematics(local, motion.root * scale, skeleton.offsets, skeleton.parents)
     weights = np.ones(len(own))
     floor = motion.joints[:, feet[:, 1], 1].min()

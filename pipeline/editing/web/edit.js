@@ -7,7 +7,7 @@ import { HANDLES, History, freshState, mark, missing, paceOf, pin, resize, rowsO
 
 const one = (id) => document.getElementById(id);
 const panel = one("edit"), go = one("edit-go"), why = one("edit-why"), marks = one("edit-marks"), draw = one("edit-draw"), joints = one("edit-joint");
-const CLIP = /\.(npz|bvh|glb)$/i, ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }, PIXELS = 6;
+const CLIP = /\.(npz|bvh|glb|vrma?)$/i, ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }, PIXELS = 6;
 
 /* The part of a page (`serve.js`). */
 export function begin(page) {

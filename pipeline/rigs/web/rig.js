@@ -1,9 +1,11 @@
 'use strict';
 // Draws one GLB character with its skin, shapes and base colours, and plays its animations. Nothing is loaded.
-(async () => {
-  const data = JSON.parse(document.getElementById('data').textContent);
-  document.querySelector('h1').textContent = data.title;
-  document.getElementById('note').textContent = data.note;
+// `root` holds nodes with `data-rig`: title, note, canvas, play, motion, time, clock; and buttons with `data-turn`.
+// It ends when another one is drawn in the same root.
+window.motionloomRig = async (root, data) => {
+  const one = (name) => root.querySelector(`[data-rig=${name}]`);
+  one('title').textContent = data.title;
+  one('note').textContent = data.note;
   const file = Uint8Array.from(atob(data.glb), (letter) => letter.charCodeAt(0));
   const view = new DataView(file.buffer);
   const length = view.getUint32(12, true);
@@ -109,10 +111,11 @@
   }
 
   // Drawing.
-  const canvas = document.querySelector('canvas');
+  const canvas = one('canvas').cloneNode();
+  one('canvas').replaceWith(canvas);
   const gl = canvas.getContext('webgl2', { antialias: true, preserveDrawingBuffer: true });
   if (!gl) {
-    document.getElementById('note').textContent += '\nThis browser draws no WebGL 2.';
+    one('note').textContent += '\nThis browser draws no WebGL 2.';
     return;
   }
   function program(vertex, fragment) {
@@ -177,14 +180,14 @@
   for (const [number, node] of gltf.nodes.entries()) {
     if (node.mesh === undefined) continue;
     const mesh = gltf.meshes[node.mesh];
-    for (const one of mesh.primitives) {
-      if ((one.mode ?? 4) !== 4 || one.extensions?.KHR_draco_mesh_compression) continue;
-      const material = gltf.materials?.[one.material] || {};
+    for (const part of mesh.primitives) {
+      if ((part.mode ?? 4) !== 4 || part.extensions?.KHR_draco_mesh_compression) continue;
+      const material = gltf.materials?.[part.material] || {};
       const colour = material.pbrMetallicRoughness || {};
-      const position = Float32Array.from(values(one.attributes.POSITION));
+      const position = Float32Array.from(values(part.attributes.POSITION));
       const count = position.length / 3;
-      const index = one.indices === undefined ? Uint32Array.from({ length: count }, (_, k) => k) : Uint32Array.from(values(one.indices));
-      let normal = one.attributes.NORMAL === undefined ? null : Float32Array.from(values(one.attributes.NORMAL));
+      const index = part.indices === undefined ? Uint32Array.from({ length: count }, (_, k) => k) : Uint32Array.from(values(part.indices));
+      let normal = part.attributes.NORMAL === undefined ? null : Float32Array.from(values(part.attributes.NORMAL));
       if (!normal) {
         normal = new Float32Array(position.length);
         for (let k = 0; k < index.length; k += 3) {
@@ -199,9 +202,9 @@
       gl.bindVertexArray(vao);
       const given = [
         [position, 3], [normal, 3],
-        [one.attributes.TEXCOORD_0 === undefined ? new Float32Array(count * 2) : Float32Array.from(values(one.attributes.TEXCOORD_0)), 2],
-        [one.attributes.JOINTS_0 === undefined ? new Float32Array(count * 4) : Float32Array.from(values(one.attributes.JOINTS_0)), 4],
-        [one.attributes.WEIGHTS_0 === undefined ? new Float32Array(count * 4) : Float32Array.from(values(one.attributes.WEIGHTS_0)), 4],
+        [part.attributes.TEXCOORD_0 === undefined ? new Float32Array(count * 2) : Float32Array.from(values(part.attributes.TEXCOORD_0)), 2],
+        [part.attributes.JOINTS_0 === undefined ? new Float32Array(count * 4) : Float32Array.from(values(part.attributes.JOINTS_0)), 4],
+        [part.attributes.WEIGHTS_0 === undefined ? new Float32Array(count * 4) : Float32Array.from(values(part.attributes.WEIGHTS_0)), 4],
       ];
       const buffers = given.map(([numbers, width], at) => {
         const out = buffer(gl.ARRAY_BUFFER, numbers);
@@ -211,7 +214,7 @@
       });
       buffer(gl.ELEMENT_ARRAY_BUFFER, index);
       gl.bindVertexArray(null);
-      const targets = (one.targets || []).map((target) => (target.POSITION === undefined ? null : values(target.POSITION)));
+      const targets = (part.targets || []).map((target) => (target.POSITION === undefined ? null : values(target.POSITION)));
       const skin = node.skin === undefined ? null : gltf.skins[node.skin];
       parts.push({
         node: number, vao, count: index.length, position, points: buffers[0], targets, skin,
@@ -310,8 +313,8 @@
   }
 
   // Controls.
-  const [play, chosen, slider, clock] = ['play', 'motion', 'time', 'clock'].map((name) => document.getElementById(name));
-  motions.forEach((motion, number) => chosen.append(new Option(motion.name, number)));
+  const [play, chosen, slider, clock] = ['play', 'motion', 'time', 'clock'].map(one);
+  chosen.replaceChildren(...motions.map((motion, number) => new Option(motion.name, number)));
   let time = 0;
   let going = !matchMedia('(prefers-reduced-motion: reduce)').matches;
   let last = performance.now();
@@ -319,7 +322,7 @@
   play.onclick = () => { going = !going; label(); };
   slider.oninput = () => { time = slider.value * motions[chosen.value].end; going = false; label(); };
   chosen.onchange = () => { time = 0; };
-  document.querySelectorAll('[data-turn]').forEach((one) => { one.onclick = () => { turn = Number(one.dataset.turn); }; });
+  root.querySelectorAll('[data-turn]').forEach((button) => { button.onclick = () => { turn = Number(button.dataset.turn); }; });
   canvas.onpointerdown = (event) => canvas.setPointerCapture(event.pointerId);
   canvas.onpointermove = (event) => {
     if (!event.buttons) return;
@@ -327,11 +330,17 @@
     tilt = Math.min(Math.max(tilt + event.movementY * 0.01, -0.3), 1.5);
   };
   canvas.onwheel = (event) => { event.preventDefault(); far = Math.min(Math.max(far * Math.exp(event.deltaY * 0.001), 0.15), 5); };
-  document.onkeydown = (event) => {
-    if (event.key === ' ') { event.preventDefault(); play.click(); }
+  root.onkeydown = (event) => {
+    if (event.key !== ' ' || event.target.closest('button, input, select')) return;
+    event.preventDefault();
+    play.click();
   };
   label();
   function tick(now) {
+    if (!canvas.isConnected) {
+      gl.getExtension('WEBGL_lose_context')?.loseContext();
+      return;
+    }
     const motion = motions[chosen.value];
     if (going) time = (time + (now - last) / 1000) % motion.end;
     last = now;
@@ -343,4 +352,4 @@
   }
   requestAnimationFrame(tick);
   window.drawn = parts.length;
-})();
+};

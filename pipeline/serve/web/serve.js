@@ -171,8 +171,10 @@ for (const name of ["dragover", "drop", "dragleave"]) {
 }
 
 const page = {
-  say, post, send, mount, note, savable,
+  say, post, send, mount, note, savable, keep,
   get info() { return info; },
+  /* What the buttons save: `{ path, body }` of a request; null where nothing is. */
+  get asked() { return asked; },
   get current() { return current; },
   set current(clip) { current = clip; },
   get turn() { return turn; },
