@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.os_errors import naming
 
 MOST_JSON_BYTES = 2**28
 """Larger JSON files are refused unread: the manifest of a million clips has a few megabytes."""
@@ -23,7 +24,8 @@ def read_plain(path: Path, most: int = MOST_JSON_BYTES, name: str = "") -> bytes
     size = require_plain(path, name)
     if size > most:
         raise UserError(f"{name or path}: {size:,} bytes; at most {most:,} are read")
-    return path.read_bytes()
+    with naming(name or path):
+        return path.read_bytes()
 
 
 def open_plain(path: Path, name: str = "") -> BinaryIO:

@@ -10,6 +10,7 @@ import os
 import re
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 _AGAIN = "what was finished is kept, and nothing half-written is left under a final name"
@@ -53,8 +54,30 @@ _TORCH = ("PytorchStreamWriter", "PytorchStreamReader", "inline_container")
 
 
 def of_the_machine(error: BaseException) -> bool:
-    """Whether an error says that the machine is at its limits, whatever file was read or written."""
-    return isinstance(error, OSError) and error.errno in _OF_THE_MACHINE
+    """Whether an error, or one that it was raised from, says that the machine is at its limits, whatever file
+    was read or written."""
+    found = (error, *_causes(error))
+    return any(isinstance(one, OSError) and one.errno in _OF_THE_MACHINE for one in found)
+
+
+def lacks_memory(error: BaseException) -> bool:
+    """Whether there was no memory left, a GPU's included, in Python's, the system's or torch's words."""
+    if isinstance(error, RuntimeError):
+        return "out of memory" in str(error) or "allocate memory" in str(error)
+    return isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM
+
+
+@contextmanager
+def naming(path: Path | str, *instead: object) -> Iterator[None]:
+    """Have an error of the system that names no file, or one of `instead`, name `path`."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and error.filename in (None, *instead):
+            error.filename = str(path)
+            if error.filename2 is not None:
+                error.filename2 = None
+        raise
 
 
 def full_place(error: OSError, folder: Path) -> str:
@@ -83,6 +106,8 @@ def sentence_of(error: BaseException) -> str | None:
         if error.errno is not None and error.filename is not None:
             return _named(error, (error.strerror or os.strerror(error.errno)).lower())
     text = str(error)
+    if lacks_memory(error):
+        return _WORDS[errno.ENOMEM]
     if isinstance(error, RuntimeError) and any(words in text for words in _OF_SHARED_MEMORY):
         return _SHARED_FULL
     rust = _RUST.search(text)

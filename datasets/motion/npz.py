@@ -123,10 +123,11 @@ class NpzFile:
             if isinstance(path, Path):
                 require_plain(path, self.label)
             self._zip = zipfile.ZipFile(path)
-        except OSError as error:
-            raise UserError(f"{self.label}: cannot be read ({error.strerror or error})") from None
-        except (zipfile.BadZipFile, NotImplementedError, ValueError):
-            raise UserError(f"{self.label}: not an .npz file, or cut off") from None
+        except (OSError, zipfile.BadZipFile, NotImplementedError, ValueError) as error:
+            system = error.__context__ or error  # zipfile takes a disk that cannot be read for another file
+            bad = isinstance(system, OSError)
+            why = f"cannot be read ({system.strerror or system})" if bad else "not an .npz file, or cut off"
+            raise UserError(f"{self.label}: {why}") from None
         self._map: mmap.mmap | None = None
         names = [name for name in self._zip.namelist() if name.endswith(".npy")]
         self.names = frozenset(name.removesuffix(".npy") for name in names)

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import write_text
+from motionloom.datasets.base.os_errors import of_the_machine
 from motionloom.datasets.base.printable import printable
 from motionloom.datasets.base.records import Dropped
 
@@ -25,7 +26,9 @@ _FILE = re.compile(r"(?!m/s\b)[^\s'\",;()]*(?:/|\.[A-Za-z]\w{1,4}\b)[^\s'\",;:()
 
 
 def drop(label: str, error: Exception) -> Dropped:
-    """The manifest's record of a clip or file that failed."""
+    """The manifest's record of a clip or file that failed; raises an error that is the machine's fault."""
+    if of_the_machine(error):
+        raise error
     text = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
     if isinstance(error, OSError) and error.strerror:  # whose own words name a path of this machine
         text = f"cannot be read ({error.strerror.lower()})"

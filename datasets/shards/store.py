@@ -92,7 +92,7 @@ class LocalStore:
                 raise UserError(no_such_folder(self.root)) from None
             raise MissingFileError(f"{where}: no such file") from None
         except OSError as error:
-            raise UserError(f"{where}: cannot be read ({error})") from None
+            raise UserError(f"{where}: cannot be read ({error.strerror or error})") from None
 
     def open_index(self, digest: str, name: str = INDEX_FILE) -> BinaryIO:
         """`index.npz` of the manifest with that sha256, or another that `digest` decides, seekable."""
@@ -101,7 +101,7 @@ class LocalStore:
         except FileNotFoundError:
             raise MissingFileError(f"{self.where(name)}: no such file") from None
         except OSError as error:
-            raise UserError(f"{self.where(name)}: cannot be read ({error})") from None
+            raise UserError(f"{self.where(name)}: cannot be read ({error.strerror or error})") from None
 
     def open_shard(self, shard: ShardInfo) -> int:
         """A descriptor of a shard, to be closed by the caller. A pipe is not waited for."""
@@ -110,7 +110,7 @@ class LocalStore:
         except FileNotFoundError:
             raise MissingFileError(f"{self.where(shard.name)}: no such file") from None
         except OSError as error:
-            raise UserError(f"{self.where(shard.name)}: cannot be read ({error})") from None
+            raise UserError(f"{self.where(shard.name)}: cannot be read ({error.strerror or error})") from None
 
     def digest(self, name: str) -> str | None:
         """sha256 of a stored file; None if it is missing."""

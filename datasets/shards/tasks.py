@@ -17,7 +17,6 @@ from typing import Generic, NamedTuple, TypeVar
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import HashingFile, atomic_file, sha256_of_json, write_json
 from motionloom.datasets.base.json_doors import open_plain
-from motionloom.datasets.base.os_errors import of_the_machine
 from motionloom.datasets.base.randomness import permutation
 from motionloom.datasets.base.records import SPLITS, ClipMeta, Dropped, MotionType, ShardInfo, Split
 from motionloom.datasets.motion.layout import MotionLayout
@@ -252,10 +251,7 @@ def convert_item(task: ShardTask[T], convert: Convert[T], item: ShardItem[T]) ->
         return Dropped(source=label, reason=str(decision))
     except MemoryError:
         raise
-    # A full disk is no fault of this clip: such errors stop the run, and what is finished stays.
     except Exception as error:  # a converter meets whatever a bad file makes of its libraries
-        if of_the_machine(error):
-            raise
         failed = drop(label, error)
         if task.strict:
             raise UserError(

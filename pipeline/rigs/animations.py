@@ -6,11 +6,13 @@ are not read.
 
 from __future__ import annotations
 
+import json
 import re
 import tempfile
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +27,12 @@ from motionloom.pipeline.rigs.gltf import Gltf
 from motionloom.pipeline.rigs.rig import Rig
 
 Floats = NDArray[np.float64]
+T = TypeVar("T")
 
 SUFFIX = ".animation"
 ENDINGS = (".glb", ".vrm", ".vrma")
 _RATES = (10.0, 120.0)
+_MOST_ANIMATIONS = 1000
 _MOST_SECONDS, _MOST_POSES, _POSES_A_KEY = 3600.0, 300_000, 100
 """Length of a clip, and its frames times the file's nodes: 100 seconds of 150 nodes at 20 a second, and more
 the more keys it has, so that two keys hours apart take no memory."""
@@ -56,9 +60,13 @@ def _words(animation: dict[str, Any]) -> str:
 
 
 @lru_cache(maxsize=4)
-def _rig(path: Path, changed: int, size: int) -> Rig:
-    """The character of a file as it was then, which the clips of one file share: a file may have hundreds."""
-    return Rig.read(path)
+def _rig(path: Path, changed: int, size: int) -> Rig | UserError:
+    """The character of a file as it was then, or why it has none, which the clips of one file share: a file
+    may have hundreds."""
+    try:
+        return Rig.read(path)
+    except UserError as error:
+        return error
 
 
 def _animations(gltf: Gltf) -> list[dict[str, Any]]:
@@ -66,6 +74,8 @@ def _animations(gltf: Gltf) -> list[dict[str, Any]]:
     found = gltf.json.get("animations") or []
     if not isinstance(found, list) or not all(isinstance(one, dict) for one in found):
         raise UserError(f"{gltf.where}: its animations cannot be read")
+    if len(found) > _MOST_ANIMATIONS:
+        raise UserError(f"{gltf.where}: {len(found)} animations, at most {_MOST_ANIMATIONS} are read; cut it")
     return found
 
 
@@ -76,7 +86,30 @@ def read_animation(path: Path, label: str) -> bytes:
     except OSError as error:
         raise UserError(f"{label}: cannot be read ({error.strerror})") from None
     rig = _rig(path.parent, about.st_mtime_ns, about.st_size)
-    rotations, root, fps = _posed(rig, _number(path), label)
+    if isinstance(rig, UserError):
+        raise rig
+    return _made(_text, rig, _number(path), label)
+
+
+def _made(make: Callable[[Rig, str], T], rig: Rig, number: int, label: str) -> T:
+    """What `make` makes of an animation's channels and samplers as JSON, by which a file that names one a
+    thousand times is read once.
+    """
+    animations = _animations(rig.gltf)
+    if not 0 <= number < len(animations):
+        raise UserError(f"{label}: {Path(rig.gltf.where).name} has {len(animations)} animations")
+    try:
+        return make(rig, json.dumps([animations[number].get(key) for key in ("channels", "samplers")]))
+    except UserError as error:
+        raise UserError(f"{label}: {error}") from None
+    except (ArithmeticError, ValueError) as error:
+        raise UserError(f"{label}: an animation whose numbers are no motion ({error})") from None
+
+
+@lru_cache(maxsize=1)
+def _text(rig: Rig, animation: str) -> bytes:
+    """The BVH text of an animation."""
+    rotations, root, fps = _posed(rig, animation)
     with tempfile.TemporaryDirectory() as folder:
         write_bvh(Path(folder) / "clip.bvh", rig.skeleton, rotations, root, fps)
         return (Path(folder) / "clip.bvh").read_bytes()
@@ -95,7 +128,7 @@ def read_character(path: Path) -> RecordedClip:
     numbers = [_number(path)] if named else range(len(animations))
     for number in numbers:
         try:
-            rotations, root, fps = _posed(rig, number, str(path))
+            rotations, root, fps = _made(_posed, rig, number, str(path))
         except UserError:
             if number == numbers[-1]:
                 raise
@@ -114,12 +147,9 @@ def _number(path: Path) -> int:
     return int(found[0]) if found else -1
 
 
-def _posed(rig: Rig, number: int, label: str) -> tuple[Floats, Floats, float]:
+def _posed(rig: Rig, animation: str) -> tuple[Floats, Floats, float]:
     """Local rotations [T, J, 3, 3], root [T, 3] and frame rate of an animation on our joints."""
-    animations = _animations(rig.gltf)
-    if not 0 <= number < len(animations):
-        raise UserError(f"{label}: {Path(rig.gltf.where).name} has {len(animations)} animations")
-    turns, places, fps = _played(rig, animations[number], label)
+    turns, places, fps = _played(rig, *json.loads(animation))
     return (*_ours(rig, turns, places), fps)
 
 
@@ -139,13 +169,13 @@ def _ours(rig: Rig, turns: Floats, places: Floats) -> tuple[Floats, Floats]:
     return local, places @ rig.ahead.T / rig.unit
 
 
-def _played(rig: Rig, animation: dict[str, Any], label: str) -> tuple[Floats, Floats, float]:
+def _played(rig: Rig, channels: Any, samplers: Any) -> tuple[Floats, Floats, float]:
     """World rotations of all nodes [T, N, 3, 3], places of the hips [T, 3], and the frame rate."""
     gltf = rig.gltf
     try:
         tracks = [
-            (int(one["target"]["node"]), str(one["target"]["path"]), animation["samplers"][one["sampler"]])
-            for one in animation["channels"]
+            (int(one["target"]["node"]), str(one["target"]["path"]), samplers[one["sampler"]])
+            for one in channels
             if one["target"].get("path") in ("rotation", "translation") and "node" in one["target"]
         ]
         read = {
@@ -157,16 +187,16 @@ def _played(rig: Rig, animation: dict[str, Any], label: str) -> tuple[Floats, Fl
             for node, path, sampler in tracks
         }
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        raise UserError(f"{label}: an animation that cannot be read ({type(error).__name__})") from None
+        raise UserError(f"an animation that cannot be read ({type(error).__name__})") from None
     longest = max((times for times, _, _ in read.values()), key=len, default=np.zeros(1))
     if len(longest) < 2 or not np.ptp(longest) > 0:
-        raise UserError(f"{label}: an animation in which nothing moves")
+        raise UserError("an animation in which nothing moves")
     fps = float(np.clip(round(1 / float(np.median(np.diff(longest)).clip(1e-4))), *_RATES))
     seconds = min(float(max(times.max() for times, _, _ in read.values())), _MOST_SECONDS)
     at = np.arange(int(seconds * fps + 1e-6) + 1) / fps
     most = _MOST_POSES + _POSES_A_KEY * sum(len(times) for times, _, _ in read.values())
     if len(at) * len(gltf.parents) > most:
-        raise UserError(f"{label}: {len(at)} frames of {len(gltf.parents)} nodes are too many; cut it")
+        raise UserError(f"{len(at)} frames of {len(gltf.parents)} nodes are too many; cut it")
     turned = np.empty((len(gltf.parents), len(at), 3, 3))
     worlds = np.empty((len(gltf.parents), len(at), 4, 4))
     for node in gltf.in_order():

@@ -65,7 +65,13 @@ class Rig:
     @staticmethod
     def read(path: Path, own: Path | None = None) -> Rig:
         """The character of a GLB or VRM file; `own` is a JSON file of names."""
-        gltf = Gltf.read(path)
+        try:
+            return Rig._of(Gltf.read(path), path, own)
+        except (ArithmeticError, np.linalg.LinAlgError) as error:
+            raise UserError(f"{path}: a character whose bones are none ({error})") from None
+
+    @staticmethod
+    def _of(gltf: Gltf, path: Path, own: Path | None) -> Rig:
         rest = _rest_worlds(gltf)
         places = rest[:, :3, 3]
         scales = np.linalg.norm(rest[:, :3, :3], axis=1)

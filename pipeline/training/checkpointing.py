@@ -32,6 +32,7 @@ from torch import Tensor
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import HashingFile, atomic_file, remove_temporaries, sync_folder
 from motionloom.datasets.base.json_doors import require_plain
+from motionloom.datasets.base.os_errors import lacks_memory, of_the_machine
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import Means, StageModule
 from motionloom.pipeline.training.metric_log import LogState
@@ -196,18 +197,26 @@ def write_checkpoint(checkpoint: object, path: Path) -> None:
             raise
         raise UserError(
             f"{path}: the checkpoint cannot be written ({cause.strerror or cause}); those before it are "
-            f"intact: make room, and start the same command again to go on from the newest"
+            f"intact: mend that, and start the same command again to go on from the newest"
         ) from error
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
-    """Return the content of a checkpoint, its tensors mapped from disk; `DamagedError` if it is damaged."""
+    """Return the content of a checkpoint, its tensors mapped from disk; `DamagedError` if it is damaged.
+
+    A disk or a memory that fails, or a forbidden file, says nothing of it: that is a `UserError`.
+    """
     try:
         _check_seal(path)
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except DamagedError:
         raise
     except Exception as error:  # a torn file fails in many ways, all of which mean the same
+        if isinstance(error, PermissionError) or of_the_machine(error) or lacks_memory(error):
+            raise UserError(
+                f"{path}: the checkpoint cannot be read ({getattr(error, 'strerror', None) or error}); mend "
+                f"that and give the same command again, or delete it to go on from the one before"
+            ) from None
         raise DamagedError(f"cannot be read ({type(error).__name__})") from None
     if not isinstance(content, dict):
         raise DamagedError(f"holds a {type(content).__name__} and no checkpoint")

@@ -22,7 +22,7 @@ from rich.console import Console
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import state_of
-from motionloom.datasets.base.os_errors import full_place
+from motionloom.datasets.base.os_errors import full_place, lacks_memory
 from motionloom.models.training.any_trainer import OtherNetworkError
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.finite import first_failure
@@ -120,6 +120,12 @@ def explained(error: Exception, name: str, logs: Path, resume: Path | None) -> E
         return UserError(
             f"{resume}: {text}, another network than {name} has now; give the settings that it began with, "
             f"or begin anew with --from {name}"
+        )
+    if lacks_memory(error):
+        why = text.partition("\n")[0][:200]
+        return UserError(
+            f"stage {name}: rank {rank()} is out of memory ({why}); close other programs, or lower "
+            f"train.batch_size or hardware.workers; the same command goes on from the last checkpoint"
         )
     if isinstance(error, OSError) and error.errno is not None and error.filename is None:
         error.filename = full_place(error, logs.parent / "checkpoints")

@@ -20,6 +20,7 @@ from lightning.pytorch.loggers.logger import Logger
 from rich.console import Console
 
 from motionloom.datasets.base.files import write_text
+from motionloom.datasets.base.os_errors import naming
 from motionloom.models.training.distributed import rank
 from motionloom.pipeline.launch.hardware import LoggerName
 from motionloom.pipeline.store.files import open_own, read_record, write_json
@@ -172,7 +173,7 @@ class MetricLog:
 
 def _append(path: Path, lines: bytes) -> None:
     """Append lines in one write, so that a reader sees all of them or none."""
-    with open_own(path, "ab") as file:
+    with naming(path), open_own(path, "ab") as file:
         size = file.seek(0, 2)
         if file.write(lines) != len(lines):
             file.truncate(size)
