@@ -3,8 +3,8 @@
     python benchmarks/negative_filter.py CLIPS WORK
 
 CLIPS holds real captioned clips (BVH files, `captions.jsonl`, `joint_map.json`), each with several captions
-of which many are shared. One TMA for every threshold and seed, 600 steps of 64. Killed and started again it
-goes on where it was. Judged on test clips: recall under protocols A and B.
+of which many are shared. One TMA for every threshold and seed, in `--steps` of 64 clips. Killed and started
+again it goes on where it was. Judged on test clips: recall under protocols A and B.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from motionloom.pipeline.evaluation.retrieval import retrieve
 
 ARMS = {"no filter": None, "exact duplicates": 0.999, "0.95": 0.95, "0.85 (paper)": 0.85}
 """Captions with a higher sentence cosine are not negatives of each other; equal ones have 1, rounded."""
-PROTOCOL = {"split": "test", "steps": 600, "batch": 64}
+BATCH = 64
 FIGURES = ("A.t2m/R@1", "A.m2t/R@1", "B.t2m/R@1", "B.m2t/R@1")
 COLUMNS = [Column(figure.replace("/", " ").replace(".", ", ") + ", %", figure, 1, 100) for figure in FIGURES]
 
@@ -28,7 +28,9 @@ def main() -> None:
     parser.add_argument("clips", type=Path)
     parser.add_argument("work", type=Path)
     parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS))
+    parser.add_argument("--steps", type=int, default=600)
     args = arguments(parser)
+    protocol = {"split": "test", "steps": args.steps, "batch": BATCH}
     clips = args.clips.resolve()
     tma = {
         "kind": "tma",
@@ -46,8 +48,8 @@ def main() -> None:
     }  # fmt: skip
     arms = {(title, seed): f"tma{n}_{seed}" for n, title in enumerate(ARMS) for seed in args.seeds}
     for (title, seed), name in arms.items():
-        every = {"seed": seed, "checkpoint_every": 200, "validate_every": PROTOCOL["steps"]}
-        every |= {"steps": PROTOCOL["steps"], "batch_size": PROTOCOL["batch"]}
+        every = {"seed": seed, "checkpoint_every": 100, "validate_every": args.steps}
+        every |= {"steps": args.steps, "batch_size": BATCH}
         stages[name] = tma | {"loss": {"threshold": ARMS[title]}, "train": every}
     run = train(args.work / "run", stages, seed=7)
     rows = []
@@ -58,7 +60,7 @@ def main() -> None:
             found = kept(args.work / f"{name}.json", lambda name=name: measured(run, name))
             for figure, values in cells.items():
                 values.append(found[figure])
-        rows.append({"title": title, "cells": cells, "seeds": args.seeds, "protocol": PROTOCOL})
+        rows.append({"title": title, "cells": cells, "seeds": args.seeds, "protocol": protocol})
     none, *filtered = rows
     for row in filtered:
         row["title"] = f"{row['title']}, less no filter"

@@ -60,15 +60,6 @@ def test_paper_recipes_evaluate_all_clips(name: str) -> None:
     assert ("evaluator" in inputs) != name.startswith("ude")
 
 
-def test_settings_of_ude_that_the_documents_declare() -> None:
-    """docs/papers.md: deviations of columns, the discriminator's width and Adam."""
-    configs: dict[str, Any] = {stage.name: stage.config for stage in load_recipe("ude-paper").stages}
-    assert configs["evaluate"].sampling.top_p == 1.0 and not configs["stats"].group
-    loss = configs["utt"].loss
-    assert loss.discriminator.ff == 2048 and loss.discriminator_optim.betas == (0.5, 0.99)
-    assert configs["utt"].optim.betas == (0.9, 0.999)
-
-
 def test_decodings_of_one_draw_of_tokens_count_as_one() -> None:
     """Three draws decoded twice each: their interval is over three means, not over six repeats."""
     values = [1.0, 3.0, 4.0, 6.0, 8.0, 10.0]
