@@ -14,7 +14,8 @@
 The later layer wins: what is extended, the file itself, `--set`. Mappings merge key by key, lists are
 replaced whole; a stage of another kind replaces the old one whole, and `null` removes it. Then each stage's
 entry goes over what the `start` model says of it and over the `defaults` of its kind, and those over
-`trained`, which concerns all stages that train. `published: true` puts between the two the settings by which
+`trained`, which concerns all stages that train. A length in `train` may be `epochs` of a number of `clips`;
+the layer that says steps or epochs last decides. `published: true` puts between the two the settings by which
 the baselines were published (`pipeline/runs/published.yaml`), for which `trained` is not meant.
 
 With `start`, a stage without a `kind` is trained on from the model's stage of that name: same kind, same
@@ -26,6 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +49,8 @@ TRAINED = "trained"
 PUBLISHED = "published"
 """The defaults by which baselines take their published settings."""
 
+_LENGTH = ("epochs", "clips")
+"""A training's length, of which steps are made."""
 _OWN = ("optim", "train")
 """Settings that a training does not take over from the model it starts from."""
 _COMPLETED_LATER = {"missing", "value_error"}
@@ -54,28 +58,47 @@ _COMPLETED_LATER = {"missing", "value_error"}
 
 
 def published_settings() -> dict[str, Tree]:
-    """The rows of `published.yaml` by model, lengths of trainings in steps."""
+    """The rows of `published.yaml` by model."""
     table: dict[str, Tree] = read_yaml(Path(__file__).with_name("published.yaml"))
-    out: dict[str, Tree] = _in_steps(table)
+    return table
+
+
+def in_steps(settings: Tree, where: str, per_epoch: Fraction | None = None) -> Tree:
+    """Settings whose lengths in epochs became steps, at any depth; `UserError` begins with `where`.
+
+    `train: {epochs: E, clips: N, batch_size: B}` is `steps` E N / B; `drop_at_epochs` are `drop_at` alike.
+    """
+    train = settings.get("train")
+    if isinstance(train, dict) and {*_LENGTH} & train.keys():
+        counts = {name: train.get(name, 1) for name in (*_LENGTH, "batch_size")}
+        if not all(isinstance(one, int) and one > 0 for one in counts.values()) or "clips" not in train:
+            raise UserError(f"{where}.train: epochs need clips and batch_size, whole numbers above 0")
+        per_epoch = Fraction(counts["clips"], counts["batch_size"])
+        kept = {key: value for key, value in train.items() if key not in _LENGTH}
+        if "epochs" in train:
+            if "steps" in train:
+                raise UserError(f"{where}.train has steps and epochs; say steps alone")
+            kept["steps"] = round(counts["epochs"] * per_epoch)
+        settings = {**settings, "train": kept}
+    out: Tree = {}
+    for key, value in settings.items():
+        if isinstance(value, dict):
+            out[key] = in_steps(value, f"{where}.{key}", per_epoch)
+        elif key == "drop_at_epochs" and per_epoch and isinstance(value, list):
+            out["drop_at"] = [round(one * per_epoch) if isinstance(one, int) else one for one in value]
+        else:
+            out[key] = value
     return out
 
 
-def _in_steps(tree: Any) -> Any:
-    """Settings whose epochs over a number of clips became steps, at any depth."""
-    if not isinstance(tree, dict):
-        return tree
-    train = tree.get("train")
-    out = {key: _in_steps(value) for key, value in tree.items()}
-    if isinstance(train, dict) and "epochs" in train:
-        per_epoch = train["clips"] / train["batch_size"]
-        kept = {key: value for key, value in train.items() if key not in ("epochs", "clips")}
-        out["train"] = {**kept, "steps": round(train["epochs"] * per_epoch)}
-        for key, value in tree.items():
-            if isinstance(value, dict) and "drop_epochs" in value:
-                steps = [round(epoch * per_epoch) for epoch in value["drop_epochs"]]
-                rest = {name: one for name, one in value.items() if name != "drop_epochs"}
-                out[key] = {**rest, "drop_at": steps}
-    return out
+def _over(below: Tree, layer: Tree) -> Tree:
+    """`layer` over `below`, whose length in epochs it replaces by one in steps, or the other way round."""
+    said = layer.get("train")
+    old = below.get("train")
+    if isinstance(said, dict) and isinstance(old, dict):
+        replaced = "epochs" if "steps" in said else "steps" if "epochs" in said else None
+        below = {**below, "train": {key: value for key, value in old.items() if key != replaced}}
+    return merge(below, layer)
 
 
 def resolve(path: Path, overrides: Sequence[str], where: str) -> Tree:
@@ -112,9 +135,9 @@ def resolve(path: Path, overrides: Sequence[str], where: str) -> Tree:
             raise UserError(f"{where}: stages.{key} says no kind{hint}")
         shared: Tree = {}
         for concerning in _defaults_of(entry):
-            shared = merge(shared, published.get(concerning, {}).get("stage", {}))
-            shared = merge(shared, defaults.get(concerning, {}))
-        stages[key] = merge(shared, entry)
+            shared = _over(shared, published.get(concerning, {}).get("stage", {}))
+            shared = _over(shared, defaults.get(concerning, {}))
+        stages[key] = in_steps(_over(shared, entry), f"{where}: stages.{key}")
     _require_used(defaults.keys() - inherited, stages, where)
     return data
 
@@ -160,6 +183,10 @@ def _require_default(key: str, fields: object, where: str) -> None:
     if key != TRAINED and key not in kinds:
         raise UserError(f"{where}: defaults.{key}: no stage kind '{key}'{nearest(key, [TRAINED, *kinds])}")
     config: type[StageConfig] = TrainedStageConfig if key == TRAINED else kinds[key].config
+    train = fields.get("train") if isinstance(fields, dict) else None
+    if isinstance(train, dict):
+        train = {name: value for name, value in train.items() if name not in _LENGTH}
+        fields = {**fields, "train": train}
     try:
         config.model_validate(fields)
     except ValidationError as error:
