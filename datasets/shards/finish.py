@@ -31,7 +31,7 @@ from motionloom.datasets.base.records import (
 from motionloom.datasets.shards.card import CARD_FILE, write_card
 from motionloom.datasets.shards.columns import carry_over, drop_columns
 from motionloom.datasets.shards.index import ShardIndex, SplitIndex, index_path, save_index
-from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, doubtful, grouped, write_left_out
+from motionloom.datasets.shards.left_out import DOUBTFUL, LEFT_OUT_FILE, doubtful, grouped, write_left_out
 from motionloom.datasets.shards.options import SOURCE_CHECKSUM, Part
 from motionloom.datasets.shards.sample import MEMBERS
 from motionloom.datasets.shards.staging import put, staged
@@ -183,7 +183,8 @@ def finish(out: Path, planned: Planned, results: Sequence[Result]) -> Manifest:
     # The index is written before the manifest: whoever sees a manifest finds everything that it names.
     doubts: list[Dropped] = []
     splits, made_on = _finish_index(out, manifest.shards, doubts)
-    manifest = manifest.model_copy(update={"notes": [*manifest.notes, *doubtful(doubts)]})
+    others = [note for note in manifest.notes if not note.startswith(DOUBTFUL)]  # of before a removal
+    manifest = manifest.model_copy(update={"notes": [*others, *doubtful(doubts)]})
     columns = carry_over(out, out / OLD_FOLDER, manifest.shards)
     manifest = manifest.model_copy(update={"columns": columns})
     if len(made_on) > 1:

@@ -20,6 +20,9 @@ from motionloom.datasets.base.records import Dropped
 LEFT_OUT_FILE = "left-out.txt"
 """Beside the manifest, when there is anything to list: kind, source and reason of each, between tabs."""
 
+DOUBTFUL = "doubtful motion: "
+"""Begins the notes on what the judge of motion has found."""
+
 _QUOTED = re.compile(r"'[^']*'")
 _NUMBER = re.compile(r"(?<![\w.])-?\d+(?:[.,]\d+)*(?:e[+-]?\d+)?")
 _FILE = re.compile(r"(?!m/s\b)[^\s'\",;()]*(?:/|\.[A-Za-z]\w{1,4}\b)[^\s'\",;:()]*")
@@ -84,7 +87,7 @@ def grouped_notes(notes: Sequence[str]) -> list[str]:
 def doubtful(doubts: Iterable[Dropped]) -> list[str]:
     """Notes on what the judge of motion has found in clips, a line for each kind."""
     ordered = sorted(doubts, key=lambda one: one.source)
-    return [f"doubtful motion: {group}" for group in grouped(ordered)]
+    return [f"{DOUBTFUL}{group}" for group in grouped(ordered)]
 
 
 def tally(dropped: Iterable[Dropped]) -> str:

@@ -220,6 +220,10 @@ def _trunk(figure: _Figure, legs: tuple[Limb, Limb], arms: tuple[Limb, Limb]) ->
         head = free[-1] if len(free) == 2 - hung and figure.is_chain(*free) else None
     if head is not None:
         necks = [chest] if hung else figure.way(chest, figure.parents[head])
+        # An ASF's lower neck begins where the collars do: a neck is above them.
+        collar = figure.way(chest, shoulders[0])[0]
+        if len(necks) > 1 and figure.length(necks[0], collar) < _SAME_PLACE * figure.extent:
+            del necks[0]
         rows |= {"head": (head,), "neck": tuple(necks[:1]) or (chest, head, head)}
     for side, shoulder in zip(_SIDES, shoulders, strict=True):
         named = [figure.named.get((side, known.arm[0]), -1) for known in CONVENTIONS]

@@ -7,7 +7,7 @@ import hashlib
 import json
 import operator
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -115,42 +115,37 @@ class Conversion(Generic[C]):
         """
         plan = self.plan
         plan.look = self.look()
-        clips = sampled(
-            plan.items,
-            lambda item: self.converter.stratum(item[1]),
-            self.config.look,
-            lambda item: item[1].label(),
-        )
-        notes = self.converter.copies(plan)
-        if self.config.look and clips:
-            notes += [f"tried {len(clips):,} of {len(plan.items):,} clips, as a conversion reads them"]
-            notes += self._try(clips)
-        plan.notes = grouped_notes(list(dict.fromkeys([*plan.notes, *notes])))
+        notes = [*plan.notes, *self.converter.copies(plan), *(self._try() if self.config.look else ())]
+        plan.notes = grouped_notes(list(dict.fromkeys(notes)))
         width = self.config.motion_layout().dim * (2 if self.config.motion_type == "float16" else 4)
         plan.totals.bytes_needed = sum(plan.totals.frames.values()) * width + len(plan.items) * 4096
         return self
 
-    def _try(self, clips: Sequence[tuple[Split, C]]) -> list[str]:
-        """Convert clips in memory; note in the plan what becomes of them, and return what is doubted."""
+    def _try(self) -> list[str]:
+        """Convert a sample of the clips in memory; note in the plan what becomes of them, and return what is
+        doubted.
+        """
+        plan = self.plan
+        config = self.config
+        clips = sampled([clip for _, clip in plan.items], self.converter.stratum, config.look, _label)
         converter = copy.copy(self.converter)
-        if hasattr(self.config, "audio_features"):  # which take seconds a minute, and refuse nothing
-            converter.config = self.config.model_copy(update={"audio_features": False})
-        work = partial(_tried, converter, self.config.motion_type)
+        if hasattr(config, "audio_features"):  # which take seconds a minute, and refuse nothing
+            converter.config = config.model_copy(update={"audio_features": False})
         how = self.settings
+        work = partial(_tried, converter, config.motion_type)
         made = [*read_in_threads(work, clips, workers=how.workers, progress=how.progress)]
-        self.plan.reject([one for one in made if isinstance(one, Dropped)])
+        tried = f"tried {len(clips):,} of {len(plan.items):,} clips, as a conversion reads them"
+        plan.reject(one for one in made if isinstance(one, Dropped))
         metas = [meta for one in made if not isinstance(one, Dropped) for meta in one]
-        self.plan.totals.measured = {meta.id: meta.frames for meta in metas}
-        return doubtful(doubt for meta in metas for doubt in doubts_of(meta))
+        plan.totals.measured = {meta.id: meta.frames for meta in metas}
+        plan.totals.count()
+        return [tried, *doubtful(doubt for meta in metas for doubt in doubts_of(meta))]
 
 
-def _tried(
-    converter: Converter[Any, C], motion_type: MotionType, planned: tuple[Split, C]
-) -> list[ClipMeta] | Dropped:
+def _tried(converter: Converter[Any, C], motion_type: MotionType, clip: C) -> list[ClipMeta] | Dropped:
     """The facts of a clip's samples, or the reason why it has none."""
-    split, clip = planned
     item = ShardItem(clip.label(), "", clip)
-    task = ShardTask(Path(), split, 0, (item,), converter.layout, motion_type, strict=False, fingerprint="")
+    task = ShardTask(Path(), clip.split, 0, (), converter.layout, motion_type, strict=False, fingerprint="")
     made = convert_item(task, converter.convert, item)
     if isinstance(made, Dropped):
         return made

@@ -156,7 +156,6 @@ class SubsetLook:
     name: str
     clips: int
     """Clips that were read."""
-    unreadable: int
     height: float | None
     """Metres, the median figure; None when no clip could be read."""
     upright: int
@@ -195,7 +194,7 @@ class Look:
             head = f"{seen.upright} of {seen.clips}, along {seen.head} of the files"
             table.add_row(
                 escape(printable(seen.name)) or ".",
-                str(seen.clips) + (f", {seen.unreadable} unreadable" if seen.unreadable else ""),
+                str(seen.clips),
                 "" if seen.height is None else f"{seen.height:.3g} m",
                 head if seen.clips else "",
                 "" if seen.above_floor is None else f"{seen.above_floor:.2f} m above the floor",
@@ -236,7 +235,7 @@ def look_at(
     each = max(1, min(config.look, MOST_CLIPS // max(1, len(names))))
     clips: dict[str, list[SourceJoints]] = {name: [] for name in names}
     rates: dict[str, set[float]] = defaultdict(set)
-    failed: list[tuple[str, Dropped]] = []
+    failed: list[Dropped] = []
     of_these = [item for item in items if subset_of(item) in clips]
     for item in sampled(of_these, subset_of, each + _SPARE, label, most=0):
         name = subset_of(item)
@@ -247,22 +246,21 @@ def look_at(
             if not np.isfinite(seen.joints).all():
                 raise UserError(f"{label(item)}: NaN or infinity")
         except Exception as error:  # whatever a bad file makes of the libraries below; the conversion says it
-            failed.append((name, drop(label(item), error)))
+            failed.append(drop(label(item), error))
             continue
         # Ten frames a second are enough for medians, and keep hundreds of clips in memory.
         step = max(1, round(seen.fps / _FRAMES_A_SECOND))
         body = np.asarray(seen.joints[::step, :BODY_JOINTS], dtype=np.float64)
         clips[name].append(replace(seen, joints=body, fps=seen.fps / step))
         rates[name].add(seen.fps)
-    unreadable = Counter(name for name, _ in failed)
-    found = [_subset(name, seen_there, unreadable[name], rates[name]) for name, seen_there in clips.items()]
+    found = [_subset(name, seen_there, rates[name]) for name, seen_there in clips.items()]
     all_clips = [clip for seen_there in clips.values() for clip in seen_there]
     oddities = stats_of(all_clips).oddities()
     problems = [oddity.text for oddity in oddities if oddity.is_error]
     warnings = [oddity.text for oddity in oddities if not oddity.is_error]
     suggestions = _suggest(all_clips, config) if problems else []
     # One reason for every clip is a wrong option or map; several reasons are damaged files.
-    groups = grouped(drop for _, drop in failed)
+    groups = grouped(failed)
     if len(groups) == 1 and not all_clips:
         problems = [f"none could be read: {groups[0]}"]
     return Look(
@@ -289,12 +287,11 @@ def sampled(
     return [*first, *later[: max(0, most - len(first))]]
 
 
-def _subset(name: str, clips: list[SourceJoints], unreadable: int, rates: set[float]) -> SubsetLook:
+def _subset(name: str, clips: list[SourceJoints], rates: set[float]) -> SubsetLook:
     stats = stats_of(clips)
     return SubsetLook(
         name=name,
         clips=len(clips),
-        unreadable=unreadable,
         height=round(stats.height, 4) if clips else None,
         upright=round(stats.upright * len(clips)) if clips else 0,
         head=head_axis(clips) if clips else "",

@@ -32,6 +32,7 @@ from motionloom.datasets.shards.left_out import drop, grouped, grouped_notes
 
 Fate = Literal["skipped", "rejected", "unreadable", "missing"]
 """What becomes of one that is no clip; those that a conversion was to read, rejected or not, are lost."""
+_ENTRIES = "entries of the source"
 _BINS = {"clip": "of clips", "beside": "read with them", "left out": "left out", "missing": "missing",
          "not ours": "not ours"}  # fmt: skip
 """Where entries and lines end, and the words of the sums."""
@@ -109,8 +110,10 @@ class ConversionPlan(Generic[C]):
     not_ours: list[Dropped] = field(default_factory=list)
     """Entries that are not read and lines that say nothing of a clip: for the list of what is left out."""
     notes: list[str] = field(default_factory=list)
-    bins: dict[str, dict[str, str]] = field(default_factory=dict)
-    """What becomes of each entry of the source, and of each line of a list: a key of `_BINS`."""
+    bins: dict[str, Counter[str]] = field(default_factory=dict)
+    """Numbers of entries of the source, and of lines of each list, by what becomes of them (`_BINS`)."""
+    owners: dict[str, list[tuple[str, str]]] = field(default_factory=dict)
+    """The bins, and the places of lines, that count for a clip, by its file's name or its id."""
     stated: str = ""
     """Numbers that the makers of the source state, and where."""
     base: str = ""
@@ -268,23 +271,24 @@ class ConversionPlan(Generic[C]):
         # A file beside the clips that is of no use to any of them is still a file that was read.
         read = self.known.beside | _given(self.config, walked)
         homes = {_home(name) for name in (*clips, *fates, *limited)}
-        bins = self.bins.setdefault("entries of the source", {})
+        bins = self.bins.setdefault(_ENTRIES, Counter())
         entries = dict.fromkeys(walked.files, "") | walked.unread | walked.others
         for name, reason in entries.items():
             if name in clips:
-                bins[name] = "clip"
+                bins["clip"] += 1
+                self.owners.setdefault(name.removeprefix(base), []).append((_ENTRIES, ""))
             elif name in fates or name in limited:
-                bins[name] = "missing" if fates.get(name) == "missing" else "left out"
+                bins["missing" if fates.get(name) == "missing" else "left out"] += 1
             elif name in walked.unread:
-                bins[name] = "missing"
+                bins["missing"] += 1
                 self.mark_missing(name, reason)
             elif not reason and (name in read or name.lower().endswith(beside or ("\0",))):
-                bins[name] = "beside"
+                bins["beside"] += 1
             elif not reason and _home(name) in homes and not PurePosixPath(name).name.startswith("."):
-                bins[name] = "left out"
+                bins["left out"] += 1
                 self.skip(name.removeprefix(base), "nothing in the lists of the source names it")
             else:
-                bins[name] = "not ours"
+                bins["not ours"] += 1
                 self.not_ours.append(Dropped(source=name, reason=reason or "not read", kind="not ours"))
         self._account_lines()
 
@@ -293,48 +297,45 @@ class ConversionPlan(Generic[C]):
         clips = {name: clip for _, clip in self.items for name in (clip.id, file_of(clip))}
         fates = {name: one.fate for one in self.not_taken for name in one.names}
         for line in self.known.lines:
-            bins = self.bins.setdefault(_list_of(line), {})
+            what = f"lines of {line.place.rpartition(':')[0]}"
+            bins = self.bins.setdefault(what, Counter())
             clip = clips.get(line.key)
             reason = line.reason
             if clip is not None and line.words and not reason and not line.words & words_of(clip):
                 reason = "none of its captions is of the clip's time"
             is_known = line.key in self.known.limited or fates.get(line.key, "missing") != "missing"
             if reason or (clip is None and is_known):
-                bins[line.place] = "left out"
+                bins["left out"] += 1
                 reason = reason or f"its clip {line.key} is left out"
                 self.not_ours.append(Dropped(source=line.place, reason=reason))
             elif clip is not None:
-                bins[line.place] = "clip"
+                bins["clip"] += 1
+                self.owners.setdefault(line.key, []).append((what, line.place))
             else:
-                bins[line.place] = "not ours" if line.is_catalogue else "missing"
+                bins["not ours" if line.is_catalogue else "missing"] += 1
 
     @property
     def sums(self) -> list[str]:
         """Entries of the source, and lines of each list, by what became of them."""
         sums = []
         for what, bins in self.bins.items():
-            counts = Counter(bins.values())
-            parts = ", ".join(f"{counts[key]:,} {words}" for key, words in _BINS.items() if counts[key])
-            sums.append(f"{counts.total():,} {what}: {parts or 'none'}")
+            parts = ", ".join(f"{bins[key]:,} {words}" for key, words in _BINS.items() if bins[key])
+            sums.append(f"{bins.total():,} {what}: {parts or 'none'}")
         return sums
 
     def reject(self, failed: Iterable[Dropped]) -> None:
-        """Move clips that could not be converted, with the entries and lines that name them, to what is left
-        out.
-        """
+        """Leave out clips that could not be converted, with the entries and lines that name them."""
         reasons = {one.source: one.reason for one in failed}
         lost = [clip for _, clip in self.items if clip.label() in reasons]
         self.items = [item for item in self.items if item[1].label() not in reasons]
-        kept = {name for _, clip in self.items for name in (clip.id, file_of(clip))}
-        names = {name for clip in lost for name in (clip.id, file_of(clip))} - kept
+        kept = {file_of(clip) for _, clip in self.items}
         for clip in lost:
             self.mark_rejected(clip, reasons[clip.label()])
-        for name in names & {file_of(clip) for clip in lost}:
-            self.bins.get("entries of the source", {}).update({self.base + name: "left out"})
-        for line in self.known.lines:
-            if line.key in names and self.bins[_list_of(line)].get(line.place) == "clip":
-                self.bins[_list_of(line)][line.place] = "left out"
-                self.not_ours.append(Dropped(source=line.place, reason=f"its clip {line.key} is left out"))
+            for name in {clip.id, file_of(clip)} - kept:
+                for what, place in self.owners.pop(name, ()):
+                    self.bins[what].update({"clip": -1, "left out": 1})
+                    if place:
+                        self.not_ours.append(Dropped(source=place, reason=f"its clip {name} is left out"))
         self.totals.count()
 
     def leave_removed(self, gone: Callable[[str, str], bool], record: str) -> None:
@@ -389,11 +390,6 @@ class ConversionPlan(Generic[C]):
     def require_settled(self) -> None:
         if self.stop:
             raise UserError(self.stop)
-
-
-def _list_of(line: ListLine) -> str:
-    """The words for the lines of a list in the sums."""
-    return f"lines of {line.place.rpartition(':')[0]}"
 
 
 def _given(config: ConvertConfig, walked: Walk) -> set[str]:

@@ -196,6 +196,10 @@ def test_real_trials_of_cmu(shared: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(clips["amc"][:, 0], hips, atol=1e-6, rtol=0)
     apart = [motion - motion[:1, :1] for motion in clips.values()]
     assert np.abs(apart[0][:, 0] - apart[1][:, 0]).max() < 0.02  # two writers' skeletons, the same way
+    necks = [
+        np.linalg.norm(one[:, 15] - one[:, 12], axis=-1).mean() for one in apart
+    ]  # both above the collars
+    assert abs(necks[0] - necks[1]) < 0.02
 
 
 # Clips taken out of a data set for good: no name is left, others are untouched, killed and made again.
