@@ -102,13 +102,24 @@ def npy_header(path: Path, where: str, most: float = math.inf) -> ArrayHeader:
         raise UserError(f"{where}: cannot be read ({error.strerror or error})") from None
 
 
+class _Mapped(np.memmap):
+    """A whole file's array, which another process is sent by its name; a part of it is sent as it is."""
+
+    path: Path | None = None
+
+    def __reduce__(self) -> Any:
+        return super().__reduce__() if self.path is None else (map_npy, (self.path,))
+
+
 def map_npy(path: Path) -> NDArray[Any]:
     """The array of a plain .npy file, read from the disk where it is looked at; `UserError` for any other."""
     header = npy_header(path, str(path))
     if not math.prod(header.shape):  # nothing cannot be mapped
         return np.empty(header.shape, header.dtype)
     order: Literal["C", "F"] = "F" if header.fortran else "C"
-    return np.memmap(path, header.dtype, "r", header.start, header.shape, order)
+    found = _Mapped(path, header.dtype, "r", header.start, header.shape, order)
+    found.path = path
+    return found
 
 
 class NpzFile:

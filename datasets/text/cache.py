@@ -58,14 +58,13 @@ class TextCache:
             self._keys = map_npy(folder / "keys.npy")
             self._sentence = map_npy(folder / "sentence.npy")
             self._tokens = map_npy(folder / "tokens.npy")
-            offsets = map_npy(folder / "offsets.npy")
+            self._offsets = offsets = map_npy(folder / "offsets.npy")
         except UserError as error:
             raise UserError(
                 f"{folder}: the text cache is damaged ({error}); run the text stage again"
             ) from None
         n = info.count
         dim = info.dim
-        self._offsets = np.array(offsets)
         rows = int(offsets[-1]) if offsets.shape == (n + 1,) and offsets.dtype == np.int64 else -1
         wanted = {"keys": (n, 32), "sentence": (n, dim), "offsets": (n + 1,), "tokens": (rows, dim)}
         kinds = (np.uint8, np.float32, np.int64, np.float16)
@@ -73,7 +72,7 @@ class TextCache:
             found = getattr(self, f"_{name}")
             if found.shape != shape or found.dtype != kind:
                 raise UserError(f"{folder}/{name}.npy: not {list(shape)}; run the text stage again")
-        if n < 0 or (np.diff(self._offsets) < 1).any() or self._offsets[0] != 0:
+        if n < 0 or (np.diff(offsets) < 1).any() or offsets[0] != 0:
             raise UserError(f"{folder}/offsets.npy: damaged; run the text stage again")
         other = folder / SIMILARITY
         self._other = TextCache(other) if (other / "cache.json").exists() else None
@@ -96,14 +95,17 @@ class TextCache:
         """Unit-length embeddings whose cosines say which captions mean the same, [n, S]."""
         return _unit((self._other or self).sentence(captions))
 
-    def sentences(self, captions: Sequence[str]) -> CaptionVectors:
-        """`sentence` of all these captions, by number."""
-        return CaptionVectors(self, self._rows(captions))
+    def places(self, captions: Sequence[str]) -> dict[str, NDArray[np.int64]]:
+        """The rows [n] of captions by which `sentences` and `similarities` find theirs."""
+        return {"sentence": self._rows(captions), "similarity": (self._other or self)._rows(captions)}
 
-    def similarities(self, captions: Sequence[str]) -> CaptionVectors:
-        """`similarity` of all these captions, by number."""
-        cache = self._other or self
-        return CaptionVectors(cache, cache._rows(captions), unit=True)
+    def sentences(self, rows: NDArray[np.int64]) -> CaptionVectors:
+        """`sentence` of the captions of these rows, by number."""
+        return CaptionVectors(self._sentence, rows)
+
+    def similarities(self, rows: NDArray[np.int64]) -> CaptionVectors:
+        """`similarity` of the captions of these rows, by number."""
+        return CaptionVectors((self._other or self)._sentence, rows, unit=True)
 
     def tokens(self, captions: Sequence[str]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Token embeddings [n, S, E], zero padded to the longest, and the mask [n, S] of real tokens."""
@@ -152,12 +154,6 @@ class TextCache:
             )
         return rows
 
-    def __getstate__(self) -> Path:
-        return self.folder
-
-    def __setstate__(self, folder: Path) -> None:
-        TextCache.__init__(self, folder)
-
 
 def _unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
     """Vectors [n, E] of length 1; those that have it stay as they are, to the bit."""
@@ -167,11 +163,11 @@ def _unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
 
 @dataclass(frozen=True)
 class CaptionVectors:
-    """Vectors of m captions, read from the cache's files where they are asked for: a process holds none."""
+    """Vectors of m captions, read from a file where they are asked for: a process holds none."""
 
-    cache: TextCache
-    rows: NDArray[np.int64]
-    """The captions' rows in the cache, [m]."""
+    values: NDArray[np.float32]
+    rows: NDArray[np.int64] | None = None
+    """The captions' rows in the file, [m]; None if it has theirs alone."""
     unit: bool = False
     """Scaled to length 1."""
 
@@ -179,7 +175,8 @@ class CaptionVectors:
         """Vectors float32 [n, E] of captions by their numbers."""
         import torch  # only batches pay for the import
 
-        found = np.asarray(self.cache._sentence[self.rows[numbers]], dtype=np.float32)
+        rows = numbers if self.rows is None else self.rows[numbers]
+        found = np.asarray(self.values[rows], dtype=np.float32)
         return torch.from_numpy(_unit(found) if self.unit else found)
 
 

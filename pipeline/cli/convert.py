@@ -208,7 +208,7 @@ def convert_command(
 ) -> None:
     """Plan a conversion, or run it; `out` may stand for the bucket `store` at `place`."""
     from motionloom.datasets.convert.common.conversion import run_conversion
-    from motionloom.datasets.convert.repeat import Repeat
+    from motionloom.datasets.convert.repeat import is_finished, note_finished, state_of_source
 
     converter = converter_named(kind)
     config = converter.config_class.parse(fields, f"data convert {kind}")
@@ -228,8 +228,8 @@ def convert_command(
         say(console, f"convert it: {line}" if line else "nothing of it can be converted")
         return
     require_folder(out)
-    repeat = None if part or store else Repeat(converter, config, out)
-    if repeat is not None and repeat.is_finished():
+    read = "" if part or store else state_of_source(converter, config, out)
+    if read and is_finished(out, read):
         manifest = load_manifest(out)
         say_manifest(manifest, out, console)
         say(console, f"{out}: finished already, {len(manifest.shards):,} shards; nothing has changed")
@@ -257,8 +257,8 @@ def convert_command(
     for note in manifest.notes:
         if note not in conversion.plan.notes:  # said before
             say(console, f"note: {note}")
-    if repeat is not None:
-        repeat.note()
+    if read:
+        note_finished(out, read)
 
 
 def proposed(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
 from motionloom.datasets.base.errors import UserError
@@ -77,6 +78,8 @@ class Inputs(Mapping[str, Any]):
     def __init__(self, makers: Mapping[str, Callable[[], object]]) -> None:
         self._makers = dict(makers)
         self._made: dict[str, object] = {}
+        self.work: Path | None = None
+        """Folder for what the processes of a training make of them once; None without one."""
 
     @classmethod
     def roles(cls) -> tuple[Role, ...]:

@@ -6,16 +6,20 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
+
+import numpy as np
 
 from motionloom.datasets.base import files
 from motionloom.datasets.base.config import require_local
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import temporary_folder
 from motionloom.datasets.base.json_doors import read_plain
+from motionloom.datasets.base.lock import file_lock
+from motionloom.datasets.motion.npz import map_npy
 
 
 def require_folder(folder: Path) -> None:
@@ -79,6 +83,22 @@ def new_folder(folder: Path) -> Iterator[Path]:
     with _aside(folder, folder.parent) as temporary:
         yield temporary
         temporary.rename(folder)
+
+
+def made_once(folder: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Arrays that the first process makes and writes while the others of the run wait; all map them. Where
+    nothing can be written, each has its own.
+    """
+    try:
+        folder.parent.mkdir(exist_ok=True)
+        with file_lock(folder.with_name(".lock")):
+            if not folder.is_dir():
+                with new_folder(folder) as new:
+                    for name, values in make().items():
+                        np.save(new / f"{name}.npy", values, allow_pickle=False)
+    except OSError:
+        return make()
+    return {path.stem: map_npy(path) for path in folder.iterdir()}
 
 
 @contextmanager

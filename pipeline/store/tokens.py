@@ -11,8 +11,8 @@ part with a stream of its own (hands, in H2VQ) stays; that stream's tokens are n
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
@@ -34,6 +34,7 @@ from motionloom.datasets.shards.clips import ClipDataset, Source
 from motionloom.models.gpt.tokens import TokenSequence, interleave, known_tokens, stream_names
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.pipeline.store.data import captions_of
+from motionloom.pipeline.store.files import made_once
 
 Codes = dict[str, Tensor]
 
@@ -49,6 +50,12 @@ class TokenStore:
     per_group: Mapping[str, int]
     whole: NDArray[np.bool_]
     """Clips that hold all the columns the tokenizer models, [n]."""
+    file: Path | None = None
+    """The file that all of it is in."""
+
+    def __reduce__(self) -> Any:  # another process maps the file, too
+        kept = (self.codes, self.starts, self.per_group, self.whole)
+        return (TokenStore, kept) if self.file is None else (TokenStore.load, (self.file, self.per_group))
 
     @property
     def groups(self) -> NDArray[np.int64]:
@@ -58,23 +65,14 @@ class TokenStore:
         """Codes of groups `begin` + 0 .. `count` [B], int64 [B, most * per_group] a stream, with padding."""
         places = begin[:, None] + np.arange(count.max())
         groups = torch.from_numpy(np.minimum(places, self.starts[-1] - 1))
-        return {name: flat.view(-1, n)[groups].flatten(1).long() for (name, flat), n in self._streams()}
+        return {
+            name: flat.view(-1, self.per_group[name])[groups].flatten(1).long()
+            for name, flat in self.codes.items()
+        }
 
-    def whole_clips(self) -> TokenStore:
-        return self.of(self.whole)
-
-    def of(self, chosen: NDArray[np.bool_]) -> TokenStore:
-        """The store of the `chosen` [n] clips alone, in order."""
-        if chosen.all():
-            return self
-        codes = {}
-        for (name, flat), n in self._streams():
-            codes[name] = flat[torch.from_numpy(np.repeat(chosen, self.groups * n))]
-        starts = np.concatenate([[0], np.cumsum(self.groups[chosen])]).astype(np.int64)
-        return TokenStore(codes, starts, self.per_group, self.whole[chosen])
-
-    def _streams(self) -> list[tuple[tuple[str, Tensor], int]]:
-        return [((name, flat), self.per_group[name]) for name, flat in self.codes.items()]
+    def whole_codes(self, name: str) -> Tensor:
+        """The codes of a stream in the whole clips."""
+        return self.codes[name][torch.from_numpy(np.repeat(self.whole, self.groups * self.per_group[name]))]
 
     def save(self, path: Path) -> None:
         tensors = {f"codes.{name}": flat.to(torch.int32) for name, flat in self.codes.items()}
@@ -104,7 +102,7 @@ class TokenStore:
             fits = fits and flat.shape == (starts[-1] * per_group[name],) and bool((flat >= 0).all())
         if not fits:
             raise UserError(f"{path}: not the codes of clips one after the other; run the tokens stage again")
-        return TokenStore(codes, starts, per_group, whole)
+        return TokenStore(codes, starts, per_group, whole, path)
 
 
 @dataclass(frozen=True)
@@ -118,16 +116,21 @@ class TokenCaptions:
     first: NDArray[np.int64]
     count: NDArray[np.int64]
     """Groups, [m]."""
+    clips: NDArray[np.int64]
+    """Numbers of the clips in the split, [n]."""
 
     def __len__(self) -> int:
-        return len(self.starts) - 1
+        return len(self.clips)
 
     @staticmethod
-    def of(clips: Sequence[Sequence[tuple[int, int, int]]]) -> TokenCaptions:
-        """The (row, first, count) of each caption of each clip."""
-        starts = np.cumsum([0, *map(len, clips)])
-        table = np.array([caption for own in clips for caption in own], dtype=np.int64)
-        return TokenCaptions(starts, *table.reshape(-1, 3).T.copy())
+    def of(
+        captions: Sequence[Sequence[tuple[int, int, int]]], clips: NDArray[np.int64] | None = None
+    ) -> TokenCaptions:
+        """The (row, first, count) of each caption of each clip; of all clips by default."""
+        starts = np.cumsum([0, *map(len, captions)])
+        table = np.array([caption for own in captions for caption in own], dtype=np.int64)
+        clips = np.arange(len(captions)) if clips is None else clips
+        return TokenCaptions(starts, *table.reshape(-1, 3).T.copy(), clips)
 
 
 @dataclass(frozen=True)
@@ -210,7 +213,9 @@ class TokenBatches(Dataset[dict[str, Any]]):
         captions, first, groups = self._drawn(items, turns)
         rows = self.captions.rows[captions]
         batch = self._sequences(
-            self.store.starts[items] + first, groups, groups == self.captions.count[captions]
+            self.store.starts[self.captions.clips[items]] + first,
+            groups,
+            groups == self.captions.count[captions],
         )
         more = {} if self.latents is None else {"tma_text": self.latents[rows]}
         if self.present is not None:
@@ -262,26 +267,37 @@ class GptClips:
     """Clips of one split, n of them, and m different captions."""
 
     store: TokenStore
-    """Tokens of these clips alone."""
+    """Tokens of all clips of the split."""
     captions: TokenCaptions
-    texts: list[str]
-    """Texts of all different captions, [m]."""
+    tables: Mapping[str, Any]
+    """What `of_texts` has made of the texts of all different captions, [m]."""
     present: PresentTokens | None
     """Mask of their recorded tokens; None if all were recorded."""
     sources: tuple[Source, ...]
-    ids: tuple[str, ...]
-    """Ids of the clips."""
     uncaptioned: int
     """Clips that were left out because they have no caption."""
 
+    @property
+    def texts(self) -> list[str]:
+        """Texts of all different captions, where `of_texts` has not made something else of them."""
+        return list(self.tables["texts"])
+
 
 def gpt_clips(
-    dataset: ClipDataset, store: TokenStore, tokenizer: Tokenizer, *, face: bool, min_frames: int
+    dataset: ClipDataset,
+    store: TokenStore,
+    tokenizer: Tokenizer,
+    *,
+    face: bool,
+    min_frames: int,
+    of_texts: Callable[[list[str]], Mapping[str, Any]] = lambda texts: {"texts": texts},
+    note: Path | None = None,
 ) -> GptClips:
     """The clips of `dataset` that a GPT over the tokens of `tokenizer` can train on.
 
     `store` holds the tokens of all clips. Captions about fewer than `min_frames` frames give way to longer
-    ones of the same clip.
+    ones of the same clip. With `note`, a folder, one process reads the captions and writes there what they
+    are, and what `of_texts` makes of them, as arrays, which all map.
     """
     # Clips of which no stream says what was recorded cannot be learned from.
     table = present_table(tokenizer, dataset.layout)
@@ -300,25 +316,28 @@ def gpt_clips(
             f"{dataset.where}: no clip of split '{dataset.split}' has a {kind} to train a GPT on; "
             f"convert data with {kind}s"
         )
-    # Equal captions share one row of the text embeddings.
-    own = store.of(chosen)
-    rows: dict[str, int] = {}
-    captions = []
-    for number, index in enumerate(clips.tolist()):
-        clip_captions = captions_of(dataset, index, face=face)
-        frames = int(dataset.frames[index])
-        spans = caption_spans(clip_captions, dataset.layout.fps, frames, min_frames)
-        groups = int(own.groups[number])
-        captions.append([_caption(span, groups, tokenizer.group_frames, rows) for span in spans])
+
+    def read() -> dict[str, Any]:
+        # Equal captions share one row of the text embeddings.
+        rows: dict[str, int] = {}
+        captions = []
+        for index, groups in zip(clips.tolist(), store.groups[clips].tolist(), strict=True):
+            clip_captions = captions_of(dataset, index, face=face)
+            frames = int(dataset.frames[index])
+            spans = caption_spans(clip_captions, dataset.layout.fps, frames, min_frames)
+            captions.append([_caption(span, groups, tokenizer.group_frames, rows) for span in spans])
+        return {**vars(TokenCaptions.of(captions, clips)), **of_texts(list(rows))}
+
+    tables = read() if note is None else made_once(note, read)
+    own = TokenCaptions(**{field.name: tables.pop(field.name) for field in fields(TokenCaptions)})
     bits = torch.from_numpy(dataset.present[clips].astype(np.int64))
     return GptClips(
+        store,
         own,
-        TokenCaptions.of(captions),
-        list(rows),
+        tables,
         None if table.streams[bits].all() else PresentTokens(bits, table.streams, table.columns),
         # Weights count; the order of shards does not, as the tokens are all in memory.
         tuple(replace(source, shards=None) for source in dataset.sources(clips)),
-        tuple(dataset.ids[clip] for clip in clips.tolist()),
         int((usable & ~chosen).sum()),
     )
 

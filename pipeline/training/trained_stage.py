@@ -160,6 +160,7 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
 
         config = context.config
         inputs = self.inputs.of(context.given)
+        inputs.work = context.units.folder
         seed = config.train.seed_of(context.seed)
         net, facts = self.build(config, inputs, seed)
         log = _printer(context)
@@ -176,6 +177,7 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
         fit(context, module, config.train, batches.train, batches.validation)
         if rank() == 0:
             save_model(context.folder, net, facts)
+            context.units.clear()
 
     def _fill(self, net: N, path: Path) -> None:
         release = self.release(net)

@@ -10,6 +10,7 @@ import torch
 from pydantic import Field
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.text.cache import CaptionVectors
 from motionloom.models.gpt.losses import GptLossConfig
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.pipeline.contract.generation import MotionGenerator
@@ -140,27 +141,34 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
 
         data = inputs.data
         text = inputs.text.cache
-        tokenizer = inputs.tokenizer.net
         # TMA's text latents are the prior, or the target of L_align, or both.
         tma = inputs.tma if config.prior == "tma" or config.aligned else None
 
+        def of_texts(texts: list[str]) -> Mapping[str, object]:
+            # TMA reads all captions once, before the first batch.
+            latents = {} if tma is None else {"latents": tma.embed_captions(texts, text).numpy()}
+            return text.places(texts) | latents
+
         @cache
         def clips_of(split: str) -> GptClips:
-            store = inputs.tokens.open(split)
             dataset = data.split(split)
-            clips = gpt_clips(dataset, store, tokenizer, face=config.face, min_frames=config.min_frames)
+            note = inputs.work and inputs.work / (split if tma is None else f"{split} tma")
+            clips = gpt_clips(
+                dataset, inputs.tokens.open(split), inputs.tokenizer.net, face=config.face,
+                min_frames=config.min_frames, of_texts=of_texts, note=note,
+            )  # fmt: skip
             if clips.uncaptioned:
                 kind = "face caption" if config.face else "caption"
                 log(f"{split}: {clips.uncaptioned} clips without a {kind} are left out")
             return clips
 
         def tables(clips: GptClips) -> dict[str, CaptionTable | None]:
-            # TMA reads all captions once, before the first batch.
-            latents = tma.embed_captions(clips.texts, text) if tma is not None else None
-            similarity = text.similarities(clips.texts)
+            latents = None if tma is None else CaptionVectors(clips.tables["latents"])
+            similarity = text.similarities(clips.tables["similarity"])
             if config.prior == "tma":
                 return {"prior": latents, "similarity": similarity}
-            return {"prior": text.sentences(clips.texts), "similarity": similarity, "latents": latents}
+            prior = text.sentences(clips.tables["sentence"])
+            return {"prior": prior, "similarity": similarity, "latents": latents}
 
         return token_batches(net, clips_of, data.held_out().split, seed, tables)
 

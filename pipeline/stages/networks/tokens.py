@@ -90,12 +90,11 @@ class TokensStage(StageKind[TokensConfig]):
             count = len(encoded.dataset)
             store = encoded.store(context.units.read(split, len(encoded.batches)))
             store.save(context.folder / f"tokens-{split}.safetensors")
-            whole = store.whole_clips()
             used = ", ".join(
-                f"{s.name} {len(torch.unique(whole.codes[s.name]))}/{s.num_codes} codes"
+                f"{s.name} {len(torch.unique(store.whole_codes(s.name)))}/{s.num_codes} codes"
                 for s in encoded.tokenizer.streams
             )
-            lacking = count - len(whole.groups)
+            lacking = int((~store.whole).sum())
             note = f"; {lacking} clips lack hands or a face: no GPT learns tokens of those" if lacking else ""
             context.console.print(f"    {split}: {count} clips, {int(store.starts[-1])} groups; {used}{note}")
         context.units.clear()
@@ -113,9 +112,9 @@ class TokensStage(StageKind[TokensConfig]):
         """Usage of each code by the training clips."""
         out: list[Showing] = []
         tokens = self.load(stage, given, torch.device("cpu"))
-        store = tokens.open("train").whole_clips()
+        store = tokens.open("train")
         for stream in tokens.streams:
-            uses = np.bincount(store.codes[stream.name].numpy(), minlength=stream.num_codes)
+            uses = np.bincount(store.whole_codes(stream.name).numpy(), minlength=stream.num_codes)
             used = int((uses > 0).sum())
             title = f"{used} of {stream.num_codes} codes used by the training clips"
             out.append(

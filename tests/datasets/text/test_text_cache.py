@@ -213,8 +213,12 @@ def test_similarity_is_the_named_encoders_and_of_one_encoder_nothing_more_is_sto
         np.testing.assert_array_equal(one.sentence(asked), wanted("clip", asked))
         np.testing.assert_array_equal(one.similarity(asked), wanted("minilm", asked))
         some = np.array([2, 0])
-        np.testing.assert_array_equal(one.similarities(asked)[some], one.similarity(asked)[some])
-        np.testing.assert_array_equal(one.sentences(asked)[some], one.sentence(asked)[some])
+        np.testing.assert_array_equal(
+            one.similarities(one.places(asked)["similarity"])[some], one.similarity(asked)[some]
+        )
+        np.testing.assert_array_equal(
+            one.sentences(one.places(asked)["sentence"])[some], one.sentence(asked)[some]
+        )
         assert one.tokens(asked)[0].shape[::2] == (15, 6)
     for similarity in ("minilm", None):
         cache = built(tmp_path / str(similarity), "minilm", similarity)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import pickle
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -68,15 +69,11 @@ def test_tokens_of_clips_that_lack_a_part(data: Data, part: str, bit: int, tmp_p
     np.testing.assert_array_equal(store.whole, (dataset.present & bit) > 0)
     store.save(tmp_path / "tokens.safetensors")
     loaded = TokenStore.load(tmp_path / "tokens.safetensors", store.per_group)
-    whole = loaded.whole_clips()
     kept = np.flatnonzero(store.whole)
-    assert 0 < len(kept) < len(dataset) and len(whole.groups) == len(kept) and whole.whole.all()
-    for row, clip in enumerate(kept.tolist()):
-        one = whole.of(np.arange(len(kept)) == row)
-        for name, codes in store.of(np.arange(len(dataset)) == clip).codes.items():
-            assert torch.equal(one.codes[name], codes)
-    everything = replace(loaded, whole=np.ones(len(dataset), dtype=bool))
-    assert everything.whole_clips() is everything
+    assert 0 < len(kept) < len(dataset)
+    for name in store.codes:
+        own = torch.cat([codes_of(store, clip)[name] for clip in kept.tolist()])
+        assert torch.equal(loaded.whole_codes(name), own)
 
 
 def test_gpt_batches_say_which_tokens_were_recorded(data: Data) -> None:
@@ -258,12 +255,33 @@ def test_clips_without_a_caption_are_left_out(tmp_path: Path, face: bool) -> Non
     some: list[list[Caption]] = [[ALL], [], [WALKS], [], []]
     everywhere = [[ALL]] * 5
     dataset = dataset_of(tmp_path, Convert(everywhere if face else some, some if face else everywhere))
-    clips, store, net = clips_of(dataset, face=face)
+    clips, _, net = clips_of(dataset, face=face)
     assert clips.uncaptioned == 3 and set(clips.texts) == {"everything", "walks"}
-    assert len(clips.store.groups) == len(clips.captions) == 2
-    for row, clip in enumerate(sorted([places(dataset)[0], places(dataset)[2]])):
-        assert torch.equal(codes_of(clips.store, row)["body"], codes_of(store, clip)["body"])
+    assert len(clips.captions) == 2
+    assert clips.captions.clips.tolist() == sorted([places(dataset)[0], places(dataset)[2]])
     assert batches_of(clips, net)[0]["tokens"].shape[0] == 4
+
+
+def test_one_process_reads_captions_and_others_map_them(tmp_path: Path) -> None:
+    dataset = dataset_of(tmp_path, Convert([[ALL], [], [WALKS, SITS]]))
+    alone, store, net = clips_of(dataset)
+    asked: list[list[str]] = []
+
+    def of_texts(texts: list[str]) -> dict[str, Any]:
+        asked.append(texts)
+        return {"latents": torch.eye(len(texts)).numpy()}
+
+    def found() -> GptClips:
+        return gpt_clips(dataset, store, net, face=False, min_frames=16, of_texts=of_texts, note=note)
+
+    note = tmp_path / "work" / "train"
+    for clips in (found(), found(), pickle.loads(pickle.dumps(found()))):
+        for name, values in vars(alone.captions).items():
+            np.testing.assert_array_equal(vars(clips.captions)[name], values)
+        np.testing.assert_array_equal(clips.tables["latents"], torch.eye(3).numpy())
+    assert asked == [alone.texts]
+    assert len(pickle.dumps(found().tables)) < 300 + 2 * len(str(note)), "sent by name"
+    assert isinstance(pickle.loads(pickle.dumps(found().captions.rows[1:])), np.ndarray)
 
 
 def test_no_caption_at_all_is_refused(tmp_path: Path) -> None:
@@ -296,7 +314,11 @@ def test_tokens_of_another_tokenizer_are_refused(tmp_path: Path) -> None:
 
 def codes_of(store: TokenStore, clip: int) -> dict[str, torch.Tensor]:
     """The codes of one clip."""
-    return store.of(np.arange(len(store.groups)) == clip).codes
+    first, end = store.starts[clip : clip + 2]
+    return {
+        name: flat[first * n : end * n]
+        for (name, flat), n in zip(store.codes.items(), store.per_group.values(), strict=True)
+    }
 
 
 def sequence_by_sequence(batches: TokenBatches, k: int) -> dict[str, torch.Tensor]:
