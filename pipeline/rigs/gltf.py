@@ -198,9 +198,12 @@ class Gltf:
             file.write(self.to_bytes())
 
     def to_bytes(self) -> bytes:
-        """The file."""
+        """The file; `UserError` where its data is not in it."""
         self.blob += bytes(-len(self.blob) % 4)
-        self.json["buffers"] = [{"byteLength": len(self.blob)}]
+        own, *others = self.json.get("buffers") or [{}]
+        if own.get("uri"):
+            raise UserError(f"{self.where}: its data lies in another file; export it as one .glb")
+        self.json["buffers"] = [{**own, "byteLength": len(self.blob)}, *others]
         text = json.dumps(self.json, ensure_ascii=False, separators=(",", ":")).encode()
         text += b" " * (-len(text) % 4)
         chunks = struct.pack("<II", len(text), _JSON) + text

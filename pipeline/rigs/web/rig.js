@@ -181,7 +181,8 @@ window.motionloomRig = async (root, data) => {
     if (node.mesh === undefined) continue;
     const mesh = gltf.meshes[node.mesh];
     for (const part of mesh.primitives) {
-      if ((part.mode ?? 4) !== 4 || part.extensions?.KHR_draco_mesh_compression) continue;
+      const packed = Object.values(part.attributes).some((at) => gltf.bufferViews[gltf.accessors[at].bufferView]?.extensions);
+      if ((part.mode ?? 4) !== 4 || packed || part.extensions?.KHR_draco_mesh_compression) continue;
       const material = gltf.materials?.[part.material] || {};
       const colour = material.pbrMetallicRoughness || {};
       const position = Float32Array.from(values(part.attributes.POSITION));
