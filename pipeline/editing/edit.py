@@ -9,12 +9,15 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.register import register
-from motionloom.datasets.motion.body.rigid import RigidMotion, at_rate, fit_rigid, mirrored
+from motionloom.datasets.motion.body.retarget import posed_by
+from motionloom.datasets.motion.body.rigid import RigidMotion, at_rate, mirrored
 from motionloom.datasets.motion.bvh.own_file import OwnBvh
 from motionloom.datasets.motion.canonical import facing, ground, mirror, resample
+from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.layout import PIECES, piece_joints
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.models.layers.seeds import sample_seeds
@@ -91,19 +94,33 @@ def changed(clip: RecordedClip, task: EditTask) -> RecordedClip:
     posed = posed and at_rate(posed, pace, clip.fps)
     joints = once = resample(joints, pace, clip.fps)
     blend = np.clip(np.arange(len(once)) / (_BLEND * clip.fps), 0, 1)[:, None, None]
+    blend = blend * blend * (3 - 2 * blend)
+    turns = [] if posed is None else [_world(posed)]
     for _ in range(task.repeat - 1):
         turn = facing(joints[-1:])[0] - facing(once[:1])[0]
         plane = (ground(once) - ground(once[0, 0])) * np.exp(1j * turn) + ground(joints[-1, 0])
         following = np.stack([plane.imag, once[..., 1], plane.real], axis=-1)
         # The pose in which the clip ended gives way to the one in which it begins.
-        following += (joints[-1] - following[0]) * (1 - blend * blend * (3 - 2 * blend))
+        following += (joints[-1] - following[0]) * (1 - blend)
         joints = np.concatenate([joints, following[1:]])
+        if posed is not None:
+            turned = Rotation.from_euler("y", turn).as_matrix() @ turns[0]
+            away = Rotation.from_matrix(turned[0].swapaxes(-1, -2) @ turns[-1][-1]).as_rotvec()
+            eased = Rotation.from_rotvec(((1 - blend) * away).reshape(-1, 3)).as_matrix()
+            turns.append((turned @ eased.reshape(turned.shape))[1:])
     if face is not None:
         face = resample(face, pace, clip.fps)
         face = np.concatenate([face, *[face[1:]] * (task.repeat - 1)])
     if posed is not None and task.repeat > 1:
-        posed = fit_rigid(joints, posed.skeleton)
+        known = np.ones(len(posed.skeleton), dtype=np.bool_)
+        posed = posed_by(joints, np.concatenate(turns), known, posed.skeleton)
     return replace(clip, joints=joints, face=face, figure=None, posed=posed)
+
+
+def _world(posed: RigidMotion) -> NDArray[np.float64]:
+    """World rotations [T, N, 3, 3]."""
+    skeleton = posed.skeleton
+    return forward_kinematics(posed.rotations, posed.root, skeleton.offsets, skeleton.parents)[1]
 
 
 def edit_clip(
