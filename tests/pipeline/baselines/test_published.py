@@ -37,10 +37,7 @@ def decisive(config: Any) -> dict[str, Any]:
 
 
 def departures(stage: Stage, wanted: dict[str, Any], ours: dict[str, str], whole: bool = True) -> list[str]:
-    """Settings of a stage that are not published, and that `ours` does not name.
-
-    Published is what is wanted, and of the `whole` stage also the defaults of its kind.
-    """
+    """Settings other than wanted (and, of the `whole` stage, than its kind's defaults) that are not `ours`."""
     own = decisive(stage.config)
     published = flatten(wanted)
     assert published.keys() <= own.keys(), (stage.name, published.keys() - own.keys())
