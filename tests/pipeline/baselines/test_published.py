@@ -37,7 +37,7 @@ def decisive(config: Any) -> dict[str, Any]:
 
 
 def departures(stage: Stage, wanted: dict[str, Any], ours: dict[str, str], whole: bool = True) -> list[str]:
-    """Settings other than wanted (and, of the `whole` stage, than its kind's defaults) that are not `ours`."""
+    """Settings other than wanted (of the `whole` stage, than its kind's defaults) that are not `ours`."""
     own = decisive(stage.config)
     published = flatten(wanted)
     assert published.keys() <= own.keys(), (stage.name, published.keys() - own.keys())
