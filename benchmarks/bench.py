@@ -18,6 +18,8 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
+from functools import cache
+from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,12 +31,15 @@ from rich.console import Console
 
 from motionloom.datasets.actions.measure import agrees
 from motionloom.datasets.base.files import write_json
+from motionloom.pipeline.contract.fingerprint import fingerprint_fields
 from motionloom.pipeline.contract.stage import KINDS, stage_kinds
 from motionloom.pipeline.evaluation.estimate import estimate
 from motionloom.pipeline.evaluation.truth import Truth
 from motionloom.pipeline.inference.shipped_models import CARD_FIGURES
 from motionloom.pipeline.runs.api import run_recipe
+from motionloom.pipeline.runs.layers import shipped_recipes
 from motionloom.pipeline.runs.plan import Selection
+from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.store.yaml import dump_yaml
 
 HERE = Path(__file__).resolve().parent
@@ -214,18 +219,38 @@ def table_of(record: Record) -> str:
 
 
 def older_rows(record: Record) -> dict[str, str]:
-    """Title of each row that was measured by code which is another today -> of which kinds of stages.
+    """Title of each row that today's code would measure otherwise -> of which kinds or settings it is.
 
-    A row knows the versions of the kinds that it measured, or else the record those that its script used.
+    A row knows the versions of the kinds that it measured, or else the record those that its script used, and
+    of a run of a shipped recipe the settings of its stages.
     """
     out = {}
     for row in record["rows"]:
         code = row.get("code", record.get("code"))
         if code is None and "seeds" in row:  # of trainings, measured before records knew their code
             out[row["title"]] = f"of commit {record.get('commit', 'unknown')}"
-        elif changed := {kind: v for kind, v in (code or {}).items() if _version(kind) != v}:
-            out[row["title"]] = ", ".join(f"{kind} {v}, now {_version(kind)}" for kind, v in changed.items())
+            continue
+        versions = {kind: found for kind, found in (code or {}).items() if _version(kind) != found}
+        changed = [f"{kind} {found}, now {_version(kind)}" for kind, found in versions.items()]
+        now = settings_now(row["recipe"]) if row.get("recipe") in shipped_recipes() else {}
+        others = [name for name, found in row.get("settings", {}).items() if now and now.get(name) != found]
+        if changed := changed + ([f"settings of {', '.join(others)}"] if others else []):
+            out[row["title"]] = ", ".join(changed)
     return out
+
+
+def settings_digest(kind: str, config: Mapping[str, object]) -> str:
+    """A digest of the settings that decide what a stage makes, with today's defaults."""
+    read = stage_kinds()[kind].config.parse(dict(config), kind)
+    text = json.dumps(fingerprint_fields(read), sort_keys=True, default=str)
+    return sha256(text.encode()).hexdigest()[:12]
+
+
+@cache
+def settings_now(recipe: str) -> dict[str, str]:
+    """The digest of each stage of a shipped recipe."""
+    stages = load_recipe(recipe, strict=False).stages
+    return {stage.name: settings_digest(stage.kind.name, stage.config.dump()) for stage in stages}
 
 
 def _version(kind: str) -> int:

@@ -4,10 +4,10 @@
     python benchmarks/results.py --collect RUN...    # first makes records of runs of one recipe
 
 A record is a table: its title, day, commit, command, protocol, columns, and rows whose cells are values, one
-a seed, or text. A row knows the versions of the kinds of stages that it measured; where today's are others,
-the page says "of older code". Two values are both shown, several as their mean with a 95 % interval by
-Student's t over seeds. In the page, the table after the comment `<!--name-->` is that of the record `name`;
-the text around the tables is edited in the page and holds no measured figure.
+a seed, or text. A row knows the versions of the kinds of stages that it measured, and their settings; where
+today's are others, the page says "of older code". Two values are both shown, several as their mean with a
+95 % interval by Student's t over seeds. In the page, the table after the comment `<!--name-->` is that of the
+record `name`; the text around the tables is edited in the page and holds no measured figure.
 """
 
 from __future__ import annotations
@@ -18,7 +18,18 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from bench import HERE, RECORDS, SEEDS, Column, Record, arguments, command_line, report, table_of
+from bench import (
+    HERE,
+    RECORDS,
+    SEEDS,
+    Column,
+    Record,
+    arguments,
+    command_line,
+    report,
+    settings_digest,
+    table_of,
+)
 
 from motionloom.pipeline.contract.stage import stage_kinds
 from motionloom.pipeline.evaluation.figures import (
@@ -31,7 +42,7 @@ from motionloom.pipeline.evaluation.figures import (
     FigureFile,
 )
 from motionloom.pipeline.store.run_state import StageRecord, finished_records
-from motionloom.pipeline.store.yaml import flatten
+from motionloom.pipeline.store.yaml import flatten, read_yaml
 
 PAGE = HERE.parent / "docs" / "results.md"
 TABLE = re.compile(r"(<!--(\w+)-->\n)(?:\|.*\n)*(?:\n\*Of older code.*\n)?(?:\n\*Measured .*\n)?")
@@ -164,6 +175,7 @@ def row_of(run: Path, table: Table, title: str) -> Record:
     candidates = {}
     variant = list[str]()
     code = dict[str, int]()
+    settings = dict[str, str]()
     for seed in SEEDS if row == MODEL else SEEDS[:1]:
         folder = run / "stages" / f"{stage}_{seed}"
         if seed == SEEDS[0] and (run / "stages" / stage).is_dir():  # of a recipe that has one
@@ -185,12 +197,15 @@ def row_of(run: Path, table: Table, title: str) -> Record:
         if found and row == MODEL:
             model = finished_records(run).get(found.about.get("made_by", {}).get("generator", ""))
             protocol |= {"steps": steps_of(model)}
-            measured = [finished_records(run).get(folder.name), model]
-            code |= {one.kind: one.version for made in measured if made for one in (made, *made.upstream())}
+            for made in (finished_records(run).get(folder.name), model):
+                for one in (made, *made.upstream()) if made else ():
+                    code[one.kind] = one.version
+                    settings[one.name] = settings_digest(one.kind, one.config)
             variant = unlike_published(model.kind, model.config) if model else []
     drawn = {k: v for k, v in protocol.items() if k in PROTOCOL or k.startswith("sampling")}
-    facts = {"protocol": drawn, "candidates": candidates, "variant": variant}
-    return {"title": title, "cells": cells, "seeds": seeds if row == MODEL else [], "code": code, **facts}
+    facts = {"protocol": drawn, "candidates": candidates, "variant": variant, "code": code}
+    facts |= {"recipe": read_yaml(run / "recipe.yaml")["name"], "settings": settings}
+    return {"title": title, "cells": cells, "seeds": seeds if row == MODEL else [], **facts}
 
 
 def steps_of(model: StageRecord | None) -> str | int:

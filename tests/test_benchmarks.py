@@ -207,11 +207,14 @@ def test_rows_of_older_code_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     row = {"cells": {"r": [1.0]}, "seeds": [7]}
     now, then = ({"mdm": bench._version("mdm"), "gone": 0}, {"mdm": 0, "text": bench._version("text")})
     rows = [{**row, "title": "a", "code": now}, {**row, "title": "b", "code": then}, {**row, "title": "c"}]
+    own = bench.settings_now("baselines-tiny") | {"mdm": bench.settings_digest("mdm", {"min_frames": 9})}
+    rows.append({**row, "title": "d", "code": now, "recipe": "baselines-tiny", "settings": own})
     column = {"title": "R", "figure": "r", "digits": 1, "scale": 1.0}
     record = {"commit": "1234567", "columns": [column], "rows": rows}
     now_is = f"mdm 0, now {bench._version('mdm')}"
-    assert bench.older_rows(record) == {"b": now_is, "c": "of commit 1234567"}
-    assert f"*Of older code: b ({now_is}); c (of commit 1234567).*" in results.table_of(record)
+    found = {"b": now_is, "c": "of commit 1234567", "d": "settings of mdm"}
+    assert bench.older_rows(record) == found
+    assert f"*Of older code: b ({now_is}); c (of commit 1234567);" in results.table_of(record)
 
 
 OLDER = {
