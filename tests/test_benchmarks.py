@@ -212,8 +212,7 @@ def test_rows_of_older_code_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     column = {"title": "R", "figure": "r", "digits": 1, "scale": 1.0}
     record = {"commit": "1234567", "columns": [column], "rows": rows}
     now_is = f"mdm 0, now {bench._version('mdm')}"
-    found = {"b": now_is, "c": "of commit 1234567", "d": "settings of mdm"}
-    assert bench.older_rows(record) == found
+    assert bench.older_rows(record) == {"b": now_is, "c": "of commit 1234567", "d": "settings of mdm"}
     assert f"*Of older code: b ({now_is}); c (of commit 1234567);" in results.table_of(record)
 
 

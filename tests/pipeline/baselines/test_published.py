@@ -123,7 +123,6 @@ def test_every_model_has_a_row_and_every_departure_a_reason() -> None:
 
 
 def test_lengths_in_epochs_follow_the_clips() -> None:
-    """Of all stages but those that say steps; Bailando's drops go along."""
     recipe = load_recipe(
         "baselines-paper", ["defaults.trained.train.clips=2560", "gpt.train.steps=7"], strict=False
     )
