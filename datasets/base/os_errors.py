@@ -35,8 +35,8 @@ _WORDS: dict[int, str] = {
     errno.ESTALE: f"its network file system has gone away; mount that again: {_AGAIN}",
 }
 
-_NO_MORE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-_OF_THE_MACHINE = {*_NO_MORE, errno.EMFILE, errno.ENFILE, errno.EIO, errno.ENOMEM}
+NO_MORE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_OF_THE_MACHINE = {*NO_MORE, errno.EMFILE, errno.ENFILE, errno.EIO, errno.ENOMEM}
 
 _RUST = re.compile(r"\(os error (\d+)\)")
 _NUMPY_SHORT = re.compile(r"\d+ requested and \d+ written")
@@ -80,9 +80,9 @@ def naming(path: Path | str, *instead: object) -> Iterator[None]:
         raise
 
 
-def full_place(error: OSError, folder: Path) -> str:
+def full_place(folder: Path) -> str:
     """Return the place of an error without a file: shared memory if that is full and the disk is not."""
-    if error.errno not in _NO_MORE or not Path(SHARED_MEMORY).is_dir():
+    if not Path(SHARED_MEMORY).is_dir():
         return str(folder)
     shared_is_full = shutil.disk_usage(SHARED_MEMORY).free < _SPARE <= shutil.disk_usage(folder).free
     return SHARED_MEMORY if shared_is_full else str(folder)
@@ -95,10 +95,10 @@ def sentence_of(error: BaseException) -> str | None:
     what it was raised from.
     """
     if isinstance(error, OSError):
-        if error.errno in _NO_MORE and str(error.filename).startswith(SHARED_MEMORY):
+        if error.errno in NO_MORE and str(error.filename).startswith(SHARED_MEMORY):
             return _SHARED_FULL
-        # Locks of processes lie there too, and what cannot be made of one names no file.
-        nameless = error.errno == errno.ENOSPC and error.filename is None
+        # Locks of processes lie there too: what cannot make one names no file, and calls it missing at times.
+        nameless = error.errno in (errno.ENOSPC, errno.ENOENT) and error.filename is None
         if nameless and Path(SHARED_MEMORY).is_dir() and shutil.disk_usage(SHARED_MEMORY).free < _A_LOCK:
             return _SHARED_FULL
         if error.errno in _WORDS:
@@ -133,7 +133,7 @@ def _causes(error: BaseException) -> Iterator[BaseException]:
 
 def _named(error: OSError, words: str) -> str:
     """`words` behind the name of the file, where the error has one; of a copy where no more fits."""
-    name = error.filename2 if error.errno in _NO_MORE and error.filename2 is not None else error.filename
+    name = error.filename2 if error.errno in NO_MORE and error.filename2 is not None else error.filename
     if name is None or isinstance(name, int):
         return words
     return f"{os.fsdecode(name) if isinstance(name, bytes) else name}: {words}"

@@ -89,10 +89,11 @@ def join_parts(place: Path | str) -> Manifest:
         manifest = _join(out, store)
         if store is not None:
             put(store, out, CARD_FILE, LEFT_OUT_FILE, INDEX_FILE, MANIFEST_FILE)
-            keep = {tar.name for tar in manifest.tars}
-            for name in store.names(""):
+            # The plan's shards: one without a clip is an index alone. None where all was joined before.
+            keep = {path.stem for path in shards_in(out, manifest.name, ".index")}
+            for name in reversed(store.names("")):  # the records last: a join that is killed has them still
                 shard = name.removesuffix(".index").removesuffix(".tar")
-                is_stray = _is_shard(manifest.name, f"{shard}.tar") and f"{shard}.tar" not in keep
+                is_stray = _is_shard(manifest.name, f"{shard}.tar") and keep and shard not in keep
                 if is_stray or name.startswith(f"{PARTS_FOLDER}/"):
                     store.remove(name)
         return manifest

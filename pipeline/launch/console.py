@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import sys
 import warnings
 from pathlib import Path
 from typing import Any, TextIO
@@ -55,8 +56,15 @@ def _tell_warning(
     say(make_console(aside=True), f"note: {who}{' '.join(str(message).split())}", "yellow")
 
 
+def _tell_unraisable(error: sys.UnraisableHookArgs) -> None:
+    """Say what no caller can be told, but for loaders whose workers could not be started."""
+    if "_MultiProcessingDataLoaderIter" not in str(error.object):
+        sys.__unraisablehook__(error)
+
+
 def quiet_libraries() -> None:
     """Keep the libraries' chatter out of the way of our own lines."""
+    sys.unraisablehook = _tell_unraisable
     warnings.showwarning = _tell_warning
     os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
     # Threads that wait sleep: awake they take the cores of those they wait for, wherever a machine is shared.

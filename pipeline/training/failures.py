@@ -22,7 +22,7 @@ from rich.console import Console
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import state_of
-from motionloom.datasets.base.os_errors import full_place, lacks_memory
+from motionloom.datasets.base.os_errors import NO_MORE, full_place, lacks_memory
 from motionloom.models.training.any_trainer import OtherNetworkError
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.finite import first_failure
@@ -127,8 +127,8 @@ def explained(error: Exception, name: str, logs: Path, resume: Path | None) -> E
             f"stage {name}: rank {rank()} is out of memory ({why}); close other programs, or lower "
             f"train.batch_size or hardware.workers; the same command goes on from the last checkpoint"
         )
-    if isinstance(error, OSError) and error.errno is not None and error.filename is None:
-        error.filename = full_place(error, logs.parent / "checkpoints")
+    if isinstance(error, OSError) and error.errno in NO_MORE and error.filename is None:
+        error.filename = full_place(logs.parent)
     if not isinstance(error, RuntimeError):
         return error
     if isinstance(error, dist.DistBackendError) or "by peer" in text or "imed out" in text:

@@ -39,6 +39,8 @@ _STRIP = 16
 """Columns of the colours' picture: one a swatch."""
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 _LARGEST = 2**28
+_LARGEST_JSON = 2**17
+"""Bytes of the JSON in a file that is read: ours has 30 kB, and pygltflib takes 2 s a megabyte."""
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
@@ -267,7 +269,11 @@ def _unit(vectors: Values) -> NDArray[np.float32]:
 def read_glb(path: Path) -> tuple[RigidMotion, float, str]:
     """Figure, frame rate and name of the first animation; `UserError` for files not of `write_glb`."""
     raw = read_plain(path, _LARGEST)
-    parse_json(raw[20 : 20 + int.from_bytes(raw[12:16], "little")], str(path))
+    end = 20 + int.from_bytes(raw[12:16], "little")
+    if end > _LARGEST_JSON:
+        raise UserError(f"{path}: not a GLB file that motionloom wrote; give its BVH or npz")
+    about = raw[20:end]
+    parse_json(about, str(path))
     try:
         from pygltflib import GLTF2
     except ModuleNotFoundError:
@@ -275,8 +281,10 @@ def read_glb(path: Path) -> tuple[RigidMotion, float, str]:
     from scipy.spatial.transform import Rotation
 
     try:
-        gltf = GLTF2.load_from_bytes(raw)
-        blob = gltf.binary_blob() or b""
+        if raw[:4] != b"glTF":
+            raise ValueError("no GLB")
+        gltf = GLTF2.from_json(about)
+        blob = raw[end + 8 :]
         nodes = [gltf.nodes[node] for node in gltf.skins[0].joints]
         animation = gltf.animations[0]
         fps = number(animation.extras["fps"], f"{path}: fps", 1000, 0.1)

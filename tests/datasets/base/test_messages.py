@@ -44,7 +44,7 @@ def test_full_shared_memory_is_called_that(tmp_path: Path, monkeypatch: pytest.M
             shutil, "disk_usage", lambda at, usage=usage: SimpleNamespace(free=usage[str(at)])
         )
         error.filename = None
-        assert full_place(error, tmp_path) == place
+        assert full_place(tmp_path) == place
         assert ("convert_workers: 1" in str(sentence_of(error))) == (place == SHARED_MEMORY)
         error.filename = place
         assert ("hardware.workers" in str(sentence_of(error))) == (place == SHARED_MEMORY)

@@ -1,15 +1,19 @@
-"""A run that a bucket keeps: each machine has an empty disk and is killed, and the bytes are the same."""
+"""What is kept in a bucket: whoever puts it there is killed inside an upload, and the bytes are the same."""
 
 from __future__ import annotations
 
 import hashlib
 import importlib
+import os
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from bvh_clips import write_source
+
+from motionloom.datasets.shards.store import open_store
 
 RECIPE = """
 name: mirrored
@@ -24,66 +28,61 @@ stages:
     train: {steps: 24, batch_size: 8, checkpoint_every: 4, validate_every: 12}
 """
 
-
-MACHINE = """
-import os, signal, sys, threading
-from motionloom.datasets.shards.store import RemoteStore
-from motionloom.pipeline.runs.api import run_recipe
-
-recipe, out, mirror, puts, seconds = sys.argv[1:]
-put = RemoteStore.put
-left = iter(range(int(puts)))
-
-
-def killed(self, path, name, sha256):
-    if next(left, None) is None:
-        os.kill(os.getpid(), signal.SIGKILL)
-    put(self, path, name, sha256)
+COMMANDS = {
+    "run": ("run", "recipe.yaml", "--out", "{machine}", "--mirror", "{bucket}"),
+    "convert": (
+        "data", "convert", "bvh", "source", "{bucket}", "--licence", "CC0", "--workers", "1",
+        "--set", "look=0", "--set", "joint_map=source/map.json",
+    ),
+    "copy": ("data", "copy", "set", "{bucket}"),
+}  # fmt: skip
+"""Each machine has a disk of its own, which is empty."""
 
 
-RemoteStore.put = killed
-clock = threading.Timer(float(seconds), os.kill, (os.getpid(), signal.SIGKILL))
-clock.daemon = True
-clock.start()
-run_recipe(recipe, out, mirror=mirror or None)
-os._exit(0)
-"""
-"""A run that is killed in the middle of a put after so many, or after so many seconds. A process of its own:
-torch trains in no fork of one that has trained."""
-
-
-def made(run: Path) -> dict[str, str]:
-    """sha256 of what stages have made."""
-    files = [path for path in sorted(run.glob("stages/*/*")) if path.suffix in (".json", ".safetensors")]
-    return {
-        path.relative_to(run).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in files
-        if path.name not in ("started.json", "timing.json")
-    }
+def kept(bucket: str, folder: Path) -> dict[str, str]:
+    """sha256 of all that lies in a bucket, but times and speeds."""
+    store = open_store(bucket)
+    timed = ("timing.json", "started.json", "metrics.csv")
+    names = [name for name in store.names("") if not name.endswith(timed)]
+    for name in names:
+        store.get(name, folder / name)
+    return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names}
 
 
 @pytest.mark.slow
-def test_killed_anywhere_on_machines_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    recipe = tmp_path / "recipe.yaml"
-    recipe.write_text(RECIPE)
+@pytest.mark.parametrize("command", COMMANDS)
+def test_killed_inside_an_upload(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "empty").mkdir()
-    with importlib.import_module("loopback").bucket(tmp_path / "empty", every=0) as (environment, _):
+    (tmp_path / "recipe.yaml").write_text(RECIPE)
+    write_source(tmp_path / "source", [f"walk-{i}" for i in range(12)])
+    with importlib.import_module("loopback").bucket(tmp_path / "empty", every=0) as (environment, network):
         for name, value in environment.items():
             monkeypatch.setenv(name, value)
-        codes = []
-        tries: list[tuple[int, float]] = [
-            (999, 600.0),
-            (3, 600.0),
-            (9, 600.0),
-            (1, 600.0),
-            (4, 600.0),
-            (2, 12.0),
-        ]
-        for number, (puts, seconds) in enumerate([*tries, (999, 600.0), (0, 600.0)]):
-            place = "s3://shards/run" if number else ""
-            words = [recipe, tmp_path / str(number), place, str(puts), str(seconds)]
-            codes.append(subprocess.run([sys.executable, "-P", "-c", MACHINE, *words]).returncode)
-        assert codes == [0, *[-signal.SIGKILL] * 5, 0, 0]
-        whole = made(tmp_path / "0")
-        assert len(whole) == 6 and made(tmp_path / "6") == whole
-        assert made(tmp_path / "7") == whole, "of a run that is finished all is fetched, and nothing is sent"
+
+        def start(number: int, bucket: str, put: int | None = None, seconds: float | None = None) -> int:
+            """The exit code of the command on machine `number`, killed in a put, or after some seconds."""
+            words = [word.format(machine=tmp_path / str(number), bucket=bucket) for word in COMMANDS[command]]
+            line = [sys.executable, "-P", "-m", "motionloom", *words]
+            process = subprocess.Popen(line, cwd=tmp_path, start_new_session=True)
+            network.puts = 0
+            network.in_a_put = None if put is None else (put, lambda: os.killpg(process.pid, signal.SIGKILL))
+            try:
+                return process.wait(seconds)
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)
+                return process.wait()
+
+        if command == "copy":
+            words = [tmp_path / "set" if word == "{bucket}" else word for word in COMMANDS["convert"]]
+            line = [sys.executable, "-P", "-m", "motionloom", *words]
+            subprocess.run(line, cwd=tmp_path, check=True)  # type: ignore[arg-type]
+        assert start(0, "s3://shards/whole") == 0
+        puts = {"run": (3, 9, 1, 4), "convert": (0, 2, 1), "copy": (0, 3, 2)}[command]
+        codes = [start(at, "s3://shards/killed", put) for at, put in enumerate(puts, start=1)]
+        assert codes == [-signal.SIGKILL] * len(puts)
+        start(7, "s3://shards/killed", seconds=6)
+        assert start(8, "s3://shards/killed") == 0
+        whole = kept("s3://shards/whole", tmp_path / "a")
+        assert len(whole) > 5 and kept("s3://shards/killed", tmp_path / "b") == whole
+        sent = network.puts
+        assert start(9, "s3://shards/killed", 0) == 0 and network.puts == 0 < sent, "nothing is sent again"
