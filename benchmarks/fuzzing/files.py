@@ -22,11 +22,11 @@ from motionloom.datasets.audio.given_beats import with_beats
 from motionloom.datasets.audio.sound import Sound, sound_seconds
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
-from motionloom.datasets.convert.amass.smpl_npz import read_motion, read_motion_header
 from motionloom.datasets.convert.captions.collect import Captions
 from motionloom.datasets.convert.captions.humanml_index import read_index
 from motionloom.datasets.convert.common.arrays import load_array
 from motionloom.datasets.convert.common.splits import keep_mirrors_together, read_split_files
+from motionloom.datasets.convert.smpl.smpl_npz import read_motion, read_motion_header
 from motionloom.datasets.motion.body.smpl import BodyModel
 from motionloom.datasets.motion.bvh.asf import read_amc
 from motionloom.datasets.motion.bvh.joint_map import JointMap

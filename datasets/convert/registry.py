@@ -20,7 +20,7 @@ declare(
     "converter",
     {
         name: f"motionloom.datasets.convert.{name}.convert"
-        for name in ("aistpp", "amass", "bvh", "humanml3d", "motionx")
+        for name in ("aistpp", "bvh", "humanml3d", "motionx")
     },
 )
 

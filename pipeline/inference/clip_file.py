@@ -17,12 +17,12 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.json_doors import number, parse_json
 from motionloom.datasets.base.records import FACE, HANDS
 from motionloom.datasets.base.register import Table, discover, register
-from motionloom.datasets.convert.amass.smpl_npz import read_motion as read_smpl
-from motionloom.datasets.convert.amass.smpl_npz import read_motion_header
 from motionloom.datasets.convert.bvh.joint_guess import guess_joint_map
 from motionloom.datasets.convert.bvh.read import read_file, read_motion
 from motionloom.datasets.convert.bvh.settle import added_frames, settled
 from motionloom.datasets.convert.common.features import features_of, require_human, upright
+from motionloom.datasets.convert.smpl.smpl_npz import read_motion as read_smpl
+from motionloom.datasets.convert.smpl.smpl_npz import read_motion_header
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
 from motionloom.datasets.motion.body.retarget import carried
 from motionloom.datasets.motion.body.rigid import RigidMotion, with_offsets

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from motionloom.datasets.base.records import Manifest, Split
-from motionloom.datasets.convert.amass.convert import AmassConfig
 from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.registry import prepare
+from motionloom.datasets.convert.sets.amass import AmassConfig
 from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
 from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.skeleton import Skeleton

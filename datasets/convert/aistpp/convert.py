@@ -22,11 +22,11 @@ from motionloom.datasets.base.records import Caption, Split
 from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.aistpp.accompaniment import GENRES, TEMPI, song_for
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
-from motionloom.datasets.convert.amass.body import SOUND_SUFFIXES, BodyConfig, BodyRelease, analyse, cut_of
 from motionloom.datasets.convert.common.files import files_in
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, ReleaseClip
 from motionloom.datasets.convert.common.splits import read_ids
+from motionloom.datasets.convert.smpl.body import SOUND_SUFFIXES, BodyConfig, BodyRelease, analyse, cut_of
 from motionloom.datasets.motion.features.smpl75 import SMPL_JOINTS
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.synth.music.recording import PLAYED, player, render_song
@@ -53,7 +53,6 @@ class AistppConfig(BodyConfig):
     """Options of the AIST++ converter; `source` is the folder of the annotations, with motions/ in it."""
 
     layouts = ("body133", "h3d263", "smpl75")
-    everyday = ("music",)
 
     name: str = "aistpp"
     layout: str = "body133"

@@ -22,7 +22,7 @@ class BvhConfig(HumanmlConfig):
     """Options of the BVH converter."""
 
     layouts = ("body133", "wholebody313", "wholebody363", "h3d263", "tomato623")
-    everyday: ClassVar[tuple[str, ...]] = ("captions", "licence", "humanml_index", "humanml_texts")
+    everyday: ClassVar[tuple[str, ...]] = ("captions", "licence")
 
     source: Path
     """A folder of .bvh or .amc files, or one such file."""

@@ -18,13 +18,13 @@ from motionloom.datasets.base.files import is_file
 from motionloom.datasets.base.json_doors import number
 from motionloom.datasets.base.records import Caption, Split
 from motionloom.datasets.base.register import register
-from motionloom.datasets.convert.amass.body import BodyConfig, BodyRelease
 from motionloom.datasets.convert.common.arrays import check_values
 from motionloom.datasets.convert.common.facts import Fact
 from motionloom.datasets.convert.common.files import files_in, read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, ReleaseClip
 from motionloom.datasets.convert.common.tables import BadRows, captions_of, read_csv
+from motionloom.datasets.convert.smpl.body import BodyConfig, BodyRelease
 from motionloom.datasets.motion.layout import FACE_DIMS
 from motionloom.datasets.motion.npz import NpzFile
 

@@ -16,7 +16,6 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import is_file
 from motionloom.datasets.base.records import Split
 from motionloom.datasets.base.register import register
-from motionloom.datasets.convert.amass.body import SOURCE_FPS, BodyConfig, BodyRelease
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
 from motionloom.datasets.convert.common.facts import Fact
 from motionloom.datasets.convert.common.files import files_in
@@ -25,6 +24,7 @@ from motionloom.datasets.convert.common.release import Entry, Figure, ReleaseCli
 from motionloom.datasets.convert.common.splits import hash_share
 from motionloom.datasets.convert.common.tables import captions_of, read_json, require_record
 from motionloom.datasets.convert.sets.vectors import rotvecs_of_rows
+from motionloom.datasets.convert.smpl.body import SOURCE_FPS, BodyConfig, BodyRelease
 
 JOINTS = 52
 WIDTH = 3 + 6 * JOINTS

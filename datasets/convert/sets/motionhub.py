@@ -17,13 +17,13 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import is_file
 from motionloom.datasets.base.records import Caption, Split
 from motionloom.datasets.base.register import register
-from motionloom.datasets.convert.amass.body import BodyConfig, BodyRelease
 from motionloom.datasets.convert.common.facts import Fact
 from motionloom.datasets.convert.common.files import inside, read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, ReleaseClip
 from motionloom.datasets.convert.common.splits import hash_share
 from motionloom.datasets.convert.common.tables import captions_of, read_json, require_record
+from motionloom.datasets.convert.smpl.body import BodyConfig, BodyRelease
 
 TASKS = ("text_motion", "music_dance", "speech_gesture", "two_person_interaction")
 _MIRRORED = re.compile(r"(?<![^/])M(?=\d+(?:/|$))")

@@ -24,13 +24,13 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.records import Manifest, ShardInfo
 from motionloom.datasets.check.dataset import examine
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
-from motionloom.datasets.convert.amass.smpl_npz import read_motion as read_amass
 from motionloom.datasets.convert.bvh.read import read_motion
 from motionloom.datasets.convert.captions.collect import Captions
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
 from motionloom.datasets.convert.common.splits import read_ids
 from motionloom.datasets.convert.motionx.parameters import value_limits
+from motionloom.datasets.convert.smpl.smpl_npz import read_motion as read_amass
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.body.smpl import BodyModel
 from motionloom.datasets.motion.bvh.joint_map import JointMap

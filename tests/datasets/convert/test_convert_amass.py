@@ -14,10 +14,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.convert.amass.convert import AmassConfig
 from motionloom.datasets.convert.captions.humanml_index import IndexRow, clip_key, read_index
 from motionloom.datasets.convert.common.splits import hash_split
 from motionloom.datasets.convert.registry import prepare
+from motionloom.datasets.convert.sets.amass import AmassConfig
 from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
 from motionloom.datasets.motion.canonical import canonicalize, mirror
 from motionloom.datasets.motion.features.codec import decode

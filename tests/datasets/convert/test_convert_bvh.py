@@ -16,12 +16,12 @@ from shard_samples import digests
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.records import Manifest, Split
-from motionloom.datasets.convert.amass.convert import AmassConfig
 from motionloom.datasets.convert.bvh.config import BvhClip
 from motionloom.datasets.convert.bvh.convert import Bvh, BvhConfig
 from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.common.facts import parse_where, require_known
 from motionloom.datasets.convert.registry import prepare
+from motionloom.datasets.convert.sets.amass import AmassConfig
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.shards.index import ClipEntry, ShardIndex, index_path

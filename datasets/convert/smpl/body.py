@@ -21,20 +21,21 @@ from motionloom.datasets.audio.sound import read_sound, resample_sound, sound_se
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.memory import content_of
 from motionloom.datasets.base.records import Split
-from motionloom.datasets.convert.amass.convert import FINGERS_MOVE
-from motionloom.datasets.convert.amass.smpl_npz import read_motion, read_motion_header
 from motionloom.datasets.convert.common.config import END_TOLERANCE
 from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.features import canonical_smpl75, features_of, require_human, upright
 from motionloom.datasets.convert.common.files import inside
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
+from motionloom.datasets.convert.smpl.smpl_npz import read_motion, read_motion_header
 from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
 from motionloom.datasets.motion.features.smpl75 import SMPL_JOINTS
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.shards.sample import Sample
 
 SOUND_SUFFIXES = (".wav", ".flac", ".mp3", ".ogg")
+FINGERS_MOVE = 1e-3
+"""Radians. Fingers that turn less than this over a clip were not captured, but set to one pose."""
 _KEPT_PIECES = 64
 """AIST++ has 60 pieces of music: with their features and sound about 0.3 GB in each worker."""
 

@@ -19,12 +19,6 @@ from pydantic import Field
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.records import Caption, Split
 from motionloom.datasets.base.register import register
-from motionloom.datasets.convert.amass.smpl_npz import (
-    MotionHeader,
-    RateError,
-    read_motion,
-    read_motion_header,
-)
 from motionloom.datasets.convert.captions.humanml_index import (
     INDEX_FPS,
     HumanmlConfig,
@@ -48,6 +42,8 @@ from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
 from motionloom.datasets.convert.common.tables import BadRows
+from motionloom.datasets.convert.smpl.body import FINGERS_MOVE
+from motionloom.datasets.convert.smpl.smpl_npz import MotionHeader, RateError, read_motion, read_motion_header
 from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
 from motionloom.datasets.motion.canonical import mirror
 from motionloom.datasets.motion.layout import BODY_JOINTS
@@ -58,9 +54,6 @@ LICENCE = "AMASS-noncommercial"
 """Stated for every subset. The motions come from many laboratories with terms of their own, some of them
 freer, but the fits are AMASS's: non-commercial research only, and not to be passed on.
 """
-FINGERS_MOVE = 1e-3
-"""Radians. Fingers that turn less than this over a clip were not captured, but set to one pose."""
-
 _MODEL_OPTIONS = {"neutral": "body_model", "female": "body_model_female", "male": "body_model_male"}
 
 

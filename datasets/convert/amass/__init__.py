@@ -1,1 +1,0 @@
-"""AMASS to shards."""

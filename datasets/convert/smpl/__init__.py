@@ -1,0 +1,1 @@
+"""Sets whose people are parameters of SMPL, SMPL-H or SMPL-X."""
