@@ -259,8 +259,8 @@ def from_s3(root: Path, work: Path, steps: int, batch: int) -> None:
             again = sum(times > 2 for times in own.values())  # by HEAD and by GET
             said = one.communicate()[0].strip().rpartition("\n")[2]
             print(
-                f"node {rank}: {len(own)} shards, {fetched / share:.3f} of its share, {again} again, cache at "
-                f"most {largest[rank] / most:.3f} of its limit; {said}"
+                f"node {rank}: {len(own)} shards, {fetched / share:.3f} of its share, {again} again, cache "
+                f"at most {largest[rank] / most:.3f} of its limit; {said}"
             )
 
 

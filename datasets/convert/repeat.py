@@ -7,7 +7,6 @@ With another file, setting or release the digest is another, and the conversion 
 from __future__ import annotations
 
 import hashlib
-import sys
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -21,44 +20,37 @@ from motionloom.datasets.convert.common.converter import Converter
 from motionloom.datasets.convert.common.files import walk
 
 _NOTE = ".finished"
-_NO_PART = (_NOTE, ".sources.json", ".lock", ".html", ".pyc")
+_NO_PART = (_NOTE, ".sources.json", ".checked.json", ".lock", ".html", ".pyc")
 """Endings of notes, and of pages for people."""
 
 
 def state_of_source(kind: type[Converter[Any, Any]], config: ConvertConfig, out: Path) -> str:
-    """A digest of all that a conversion into `out` reads, to be taken before it is planned."""
+    """The digest of all that a conversion into `out` reads, to be taken before it is planned."""
     fields = [getattr(config, name) for name in type(config).model_fields]
     given = [one for value in fields for one in (value if isinstance(value, tuple) else [value])]
     places = [place_of(one)[0] for one in given if isinstance(one, Path)]
-    # The code too, ours and that of another package's converter.
-    code = filter(None, (getattr(sys.modules[base.__module__], "__file__", None) for base in kind.__mro__))
-    read = [*places, out / "joint_maps", *map(Path, (*code, *datasets.__path__))]
-    return f"{kind.name} {kind.version} {config!r} {_state(read, out)}"
+    # Maps that were corrected by hand, and the code; another package's converter has its version.
+    places += [out / "joint_maps", *map(Path, datasets.__path__)]
+    return _digest(f"{kind.name} {kind.version} {config!r}", places, out)
 
 
 def is_finished(out: Path, read: str) -> bool:
     """Whether the set in `out` was made from what is `read`, and is as it was noted."""
-    try:
-        return (out / _NOTE).read_text(encoding="utf-8") == _with_made(out, read)
-    except (OSError, ValueError):
-        return False
+    note = out / _NOTE
+    return note.is_file() and note.read_bytes() == _digest(read, [out]).encode()
 
 
 def note_finished(out: Path, read: str) -> None:
     """Note of what the set was made. A folder that may only be read is done without."""
     with suppress(OSError):
-        write_text(out / _NOTE, _with_made(out, read))
+        write_text(out / _NOTE, _digest(read, [out]))
 
 
-def _with_made(out: Path, read: str) -> str:
-    return hashlib.sha256(f"{read} {_state([out])}".encode(errors="backslashreplace")).hexdigest()
-
-
-def _state(places: Iterable[Path], skip: Path | None = None) -> str:
-    """The digest of the states of files, and of all files in folders."""
-    whole = hashlib.sha256()
+def _digest(about: str, places: Iterable[Path], skip: Path | None = None) -> str:
+    """The digest of a text and of the states of files, and of all files in folders."""
+    whole = hashlib.sha256(about.encode(errors="backslashreplace"))
     for place in places:
-        found = walk(place, skip=skip)
+        found = walk(place, skip)
         own = state_of(place) if place.is_file() else ""
         whole.update(f"{place} {own} {found.unread} {found.others}\n".encode(errors="backslashreplace"))
         for name in found.files:

@@ -123,13 +123,10 @@ class TokenCaptions:
         return len(self.clips)
 
     @staticmethod
-    def of(
-        captions: Sequence[Sequence[tuple[int, int, int]]], clips: NDArray[np.int64] | None = None
-    ) -> TokenCaptions:
-        """The (row, first, count) of each caption of each clip; of all clips by default."""
+    def of(captions: Sequence[Sequence[tuple[int, int, int]]], clips: NDArray[np.int64]) -> TokenCaptions:
+        """The (row, first, count) of each caption of each of the `clips`."""
         starts = np.cumsum([0, *map(len, captions)])
         table = np.array([caption for own in captions for caption in own], dtype=np.int64)
-        clips = np.arange(len(captions)) if clips is None else clips
         return TokenCaptions(starts, *table.reshape(-1, 3).T.copy(), clips)
 
 

@@ -181,6 +181,7 @@ def test_an_unchanged_conversion_is_not_planned(
         assert plans() and not plans(), changed
     write_clip(source / "sub/2.bvh", 2)
     assert plans() and not plans() and plans("--set", "look=0")
+    assert call("data", "check", out).code == 0 and not plans("--set", "look=0")
     next(out.glob("*.tar")).unlink()
     assert plans("--set", "look=0") and not plans("--set", "look=0")
 
