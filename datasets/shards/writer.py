@@ -229,23 +229,9 @@ class DatasetWriter(Generic[T]):
 
 def _planned(tasks: Sequence[ShardTask[T]], facts: DatasetFacts) -> Planned:
     layout = facts.layout
-    manifest = Manifest(
-        name=facts.name,
-        layout=layout.name,
-        family=layout.family,
-        fps=layout.fps,
-        skeleton=layout.skeleton_name,
-        licence=facts.licence,
-        converter=facts.converter,
-        converter_version=facts.converter_version,
-        options=facts.options,
-        shards=[],
-        dropped=list(facts.dropped),
-        licences=facts.licences,
-        credits=list(facts.credits),
-        audio=facts.audio,
-        notes=list(facts.notes),
-    )
+    stated = {name: value for name, value in vars(facts).items() if name in Manifest.model_fields}
+    stated |= {"layout": layout.name, "family": layout.family, "skeleton": layout.skeleton_name}
+    manifest = Manifest(**stated, fps=layout.fps, shards=[])
     return Planned(
         manifest=manifest,
         fingerprints={task.path.name: task.fingerprint for task in tasks},

@@ -98,7 +98,7 @@ def made_once(folder: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any
                         np.save(new / f"{name}.npy", values, allow_pickle=False)
     except OSError:
         return make()
-    return {path.stem: map_npy(path) for path in folder.iterdir()}
+    return {path.stem: map_npy(path) for path in folder.glob("*.npy")}
 
 
 @contextmanager
