@@ -43,6 +43,8 @@ _MEASURED = 500
 """Frames, at least, of longer clips that axes are measured on, spread evenly."""
 _MEANS = 0.02
 """Weight of joints that no joint of the file stands for."""
+_FIRM = 10.0
+"""Weight of joints that a pelvis carries: a spine that bends far does not pull at it."""
 _FEET, _KNEES = 1000.0, 0.05
 """Weights of feet that are lifted to their height, and of knees, where legs bend for it."""
 _HIGH = 0.25
@@ -167,7 +169,7 @@ def posed_by(
             targets[:, joint] = (
                 targets[:, parents[joint]] + world[:, parents[joint]] @ skeleton.offsets[joint]
             )
-            weights[joint] = 1.0
+            weights[joint] = 1.0 if parents[joint] else _FIRM
     local, root = solve_poses(targets, skeleton.offsets, skeleton.parents, local, targets[:, 0], weights)
     _, now = forward_kinematics(local, root, skeleton.offsets, skeleton.parents)
     for end in np.flatnonzero(known):

@@ -30,7 +30,11 @@ GENUINE = {
     "bandai/dataset-1.tar.xz": ("dataset-1_walk_feminine_001.bvh", "dataset-1_byebye_active_001.bvh"),
     "real/cmu/bvh_mb.tar.xz": ("02_01.bvh", "05_11.bvh"),
     "real/cmu/amc.tar.xz": ("02_01.amc",),
-    "real/hdm05/hdm05.tar.xz": ("HDM_bd_depositFloorR_001_120.amc", "HDM_bk_squat1Reps_021_120.amc"),
+    "real/hdm05/hdm05.tar.xz": (
+        "HDM_bd_depositFloorR_001_120.amc",
+        "HDM_bk_squat1Reps_021_120.amc",
+        "HDM_mm_lieDownFloor_016_120.amc",
+    ),
     "real/odd_bvh": (
         "sfu_affective_vicon.bvh",
         "freebvh.bvh",
@@ -80,7 +84,7 @@ def test_parts_look_where_the_file_says(shared: Path, tmp_path: Path, folder: st
     place = shared / "data" / folder
     if place.is_file():
         with tarfile.open(place) as tar:
-            subjects = [one.split("_0")[0].split("_de")[0].split("_sq")[0] for one in GENUINE[folder]]
+            subjects = [one[:6] if one.startswith("HDM") else one.split("_0")[0] for one in GENUINE[folder]]
             for member in tar.getmembers():
                 name = Path(member.name).name
                 if name in GENUINE[folder] or (name.endswith(".asf") and name[:-4] in subjects):
@@ -104,32 +108,45 @@ def test_parts_look_where_the_file_says(shared: Path, tmp_path: Path, folder: st
         # On other bones, with hands, they look there as well; and positions alone leave a head level.
         whole = with_hands(figure)
         require_near(on_bones(whole, Skeleton.named("smplx52").offsets), wanted)
-        assert figure.error.mean_mm < 4
+        assert figure.error.mean_mm < (8 if "lieDown" in name else 4)
         if "walk" in name or name == "02_01.bvh":
             level = shown(fit_rigid(figure.joints, BODY))["head"]
             assert abs(np.degrees(np.arcsin(np.median(level[:, 1])))) < 6
 
 
-@pytest.mark.parametrize("tool", ["LAFAN1", "Rokoko"])
+@pytest.mark.parametrize("tool", ["Mixamo", "CMU", "LAFAN1", "Rokoko", "SMPL-X", "Unreal mannequin"])
 @pytest.mark.parametrize("a_pose", [False, True])
 @pytest.mark.parametrize("along", [False, True])
 def test_built_figures_look_where_they_were_turned(tool: str, a_pose: bool, along: bool) -> None:
-    """`along`: all rest axes along the bones, so that the rest pose is a line, as LAFAN1's is."""
+    """`along`: all rest axes along the bones, so that the rest pose is a line, as LAFAN1's is. Arms hang in
+    figures whose heads lean forward, which look ahead all the same.
+    """
     built = build(next(one for one in FOREIGN if one.tool == tool), a_pose=a_pose)
+    ours = {names[0]: joint for joint, names in built.ours.items() if len(names) == 1}
+    place = [ours.get(name, "") for name in built.names]
+    lean = Rotation.from_euler("x", 40, degrees=True)
+    leaning = [place.index("neck")]
+    for joint, parent in enumerate(built.parents):
+        if a_pose and not along and parent in leaning:
+            leaning.append(joint)
+            root = built.points[leaning[0]]
+            built.points[joint] = root + lean.apply(built.points[joint] - root)
     rng = np.random.default_rng(3)
     count, times = len(built.names), np.arange(80)[:, None, None] / 30
     swing = 0.15 * np.sin(times * rng.uniform(1, 4, (count, 1))) * rng.standard_normal((count, 3))
-    for number, name in enumerate(built.names):  # elbows bend one way
-        if "ForeArm" in name:
-            swing[:, number] += [0, -0.6 if name.startswith("Left") else 0.6, 0]
+    for number, name in enumerate(place):  # elbows bend one way
+        if name.endswith("elbow"):
+            swing[:, number] += [0, -0.6 if name.startswith("left") else 0.6, 0]
     local = Rotation.from_rotvec(swing.reshape(-1, 3)).as_matrix().reshape(80, count, 3, 3)
     axes = np.broadcast_to(np.eye(3), (count, 3, 3)).copy()
     for joint in range(count if along else 0):
-        ends = [child for child, parent in enumerate(built.parents) if parent == joint]
+        ends = [child for child, parent in enumerate(built.parents) if parent == joint and place[child]]
         bone = built.points[ends[0]] - built.points[joint] if len(ends) == 1 else np.array([0.0, 1.0, 0.0])
-        if built.names[joint].endswith("Hand"):
+        if place[joint] == "head":
+            bone = np.array([0.0, 1.0, 0.0])
+        if place[joint].endswith("wrist"):
             bone = built.points[joint] - built.points[built.parents[joint]]
-        if "Toe" in built.names[joint]:
+        if "_foot" in place[joint]:
             bone = np.array([0.0, 0.0, 1.0])
         side = (
             np.array([0.0, 0.0, 1.0])

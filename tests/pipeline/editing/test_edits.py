@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,18 +13,21 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from toy_stages import FixedEncoder, MadeStage
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.convert.common.features import features_of
 from motionloom.datasets.loading.statistics import FeatureStats
+from motionloom.datasets.motion.body.rigid import RigidMotion, fit_rigid
 from motionloom.datasets.motion.canonical import canonicalize, ground, mirror
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.joints import joints_of
+from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CompletedStage, StageCache
-from motionloom.pipeline.editing.edit import EditedMotion, edit_clip, original_of
+from motionloom.pipeline.editing.edit import EditedMotion, changed, edit_clip, original_of
 from motionloom.pipeline.editing.finish import finish
 from motionloom.pipeline.editing.frames import edit_frames
 from motionloom.pipeline.editing.generator import InBetweenMotion
@@ -124,6 +128,15 @@ def test_a_clip_is_mirrored_retimed_and_repeated_without_a_model(
     assert np.ptp(there - there[0, 0], axis=0).max() < 0.05, "frames of the clip, somewhere else"
     steps = np.linalg.norm(np.diff(twice.joints, axis=0), axis=-1).max(axis=1)
     assert steps[29] < 1.5 * steps[:29].max(), "no jump where it begins again"
+    figure = fit_rigid(clip(walk).joints, twice.layout.skeleton)
+    figure.rotations[:, 15] = Rotation.from_euler("x", 40, degrees=True).as_matrix()
+    figure = RigidMotion.posed(figure.skeleton, figure.rotations, figure.root, figure.joints)
+    again = changed(replace(clip(walk), posed=figure), EditTask(repeat=2)).posed
+    assert again is not None
+    heads = forward_kinematics(again.rotations, again.root, again.skeleton.offsets, again.skeleton.parents)[1]
+    assert np.arcsin(-heads[:, 15, 1, 2]).min() > np.radians(25), (
+        "positions alone show no head that looks down"
+    )
 
 
 def test_before_after_and_between(walk: Walk) -> None:

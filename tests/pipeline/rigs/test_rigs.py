@@ -17,13 +17,15 @@ from scipy.spatial.transform import Rotation
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.expressions import APEX, BASIS
+from motionloom.datasets.motion.body.retarget import on_bones
 from motionloom.datasets.motion.body.rigid import RigidMotion, fit_rigid
 from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.pipeline.contract.generation import Prompt
+from motionloom.pipeline.inference.clip_file import read_clip
 from motionloom.pipeline.inference.files.outputs import write_motions
-from motionloom.pipeline.inference.files.writers import figure_options
+from motionloom.pipeline.inference.files.writers import default_formats, figure_options
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.rigs.animations import SUFFIX, read_animation
 from motionloom.pipeline.rigs.gltf import Gltf
@@ -133,11 +135,28 @@ def test_a_character_moves_as_the_motion_does(tmp_path: Path, motion: GeneratedM
                 or angles(bone, figure.joints[:, joint] - figure.joints[:, parent]).max() < 1
             )
     assert clip.fps == 20 and angles(clip.turns()[:, row[15], :, 2], world[:, 15, :, 2]).max() < 1
+    recorded = read_clip(path)
+    np.testing.assert_allclose(recorded.joints * 100, back[:, row], atol=1e-3)
+    assert (recorded.fps, recorded.caption) == (20, "a person walks")
+    np.testing.assert_array_equal(read_clip(path / f"00-walk{SUFFIX}").joints, recorded.joints)
     weights = [c for c in gltf.json["animations"][0]["channels"] if c["target"]["path"] == "weights"]
     keys = gltf.values(gltf.json["animations"][0]["samplers"][weights[0]["sampler"]]["output"]).reshape(40, 2)
     assert keys[-1, 0] == pytest.approx(0.5 if maker == "vrm0" else 1.0, abs=0.01) and keys[0, 0] == 0
     messages = validated(path)["issues"]["messages"]
     assert [one for one in messages if one["severity"] < 1] == []
+
+
+def test_knees_stay_as_bent_on_larger_feet() -> None:
+    rotations = np.tile(np.eye(3), (20, 52, 1, 1))
+    for joint, bent in ((1, -12), (2, -12), (4, 24), (5, 24), (7, -12), (8, -12)):
+        rotations[:, joint] = Rotation.from_euler("x", bent, degrees=True).as_matrix()
+    joints, _ = forward_kinematics(rotations, np.zeros((20, 3)), OURS.offsets, OURS.parents)
+    figure = RigidMotion.posed(OURS, rotations, np.zeros((20, 3)), joints)
+    larger = OURS.offsets * np.where([["_foot" in name] for name in OURS.joints], 2.0, 1.0)
+    back = on_bones(figure, larger).joints
+    assert angles(back[:, 4] - back[:, 1], back[:, 7] - back[:, 4]) == pytest.approx(
+        angles(joints[:, 4] - joints[:, 1], joints[:, 7] - joints[:, 4]), abs=1
+    )
 
 
 def played_at_rest(gltf: Gltf) -> tuple[Floats, Floats]:
@@ -161,6 +180,36 @@ def test_names_of_ones_own(tmp_path: Path) -> None:
         Rig.read(tmp_path / "odd.glb", tmp_path / "map.json")
     with pytest.raises(UserError, match="what --format rig is made by"):
         figure_options({"rig": "x.vrm"}, ["npz"])
+    assert set(default_formats(["rig"])) - set(default_formats()) == {"rig", "rig-page"}
+    assert figure_options({"rig": "x.vrm"}, ["rig-page"]).more == {"rig": "x.vrm"}
+    with pytest.raises(UserError, match="odd.glb: no node for pelvis"):
+        read_clip(tmp_path / "odd.glb")
+    with pytest.raises(UserError, match="hero.glb: a character without an animation"):
+        read_clip(tmp_path / "hero.glb")
+
+
+def test_other_buffers_stay_and_other_files_are_refused(tmp_path: Path) -> None:
+    character(tmp_path / "hero.glb", "mixamo")
+    gltf = Gltf.read(tmp_path / "hero.glb")
+    gltf.json["buffers"].append({"byteLength": 8})
+    gltf.write(tmp_path / "two.glb")
+    assert Gltf.read(tmp_path / "two.glb").json["buffers"][1] == {"byteLength": 8}
+    gltf.json["buffers"][0]["uri"] = "other.bin"
+    with pytest.raises(UserError, match="another file; export it as one .glb"):
+        gltf.write(tmp_path / "three.glb")
+
+
+@pytest.mark.browser
+def test_the_page_draws_the_character(tmp_path: Path, motion: GeneratedMotion, browser: Any) -> None:
+    character(tmp_path / "hero.glb", "rigify")
+    options = figure_options({"rig": str(tmp_path / "hero.glb")}, ["rig-page"])
+    [path] = write_motions(tmp_path / "out", [motion] * 2, ["rig-page"], title="<b>", figure=options)
+    page, trouble = browser.new_page(), []
+    page.on("pageerror", lambda error: trouble.append(str(error)))
+    page.goto(path.as_uri())
+    page.locator("option").nth(1).wait_for(state="attached", timeout=60_000)
+    page.locator("[data-rig=clock]", has_text="/ 1.95 s").wait_for(timeout=60_000)
+    assert page.evaluate("window.drawn") == 1 and page.inner_text("h1") == "<b>" and not trouble
 
 
 @pytest.mark.parametrize(

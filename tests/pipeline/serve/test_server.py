@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import re
 import signal
 import socket
 import sys
@@ -18,6 +19,7 @@ import numpy as np
 import pytest
 import soundfile
 from rich.console import Console
+from rig_characters import character
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.serve import guard, server
@@ -62,6 +64,19 @@ def test_the_viewers_data_and_files(served: Any, tmp_path: Path) -> None:
         assert file["joints"].shape == (20, 52, 3) and json.loads(str(file["metadata"]))["seed"] == 3
     page = served.post("/api/generate", {**WAVE, "format": "html"}).body.decode()
     assert page.startswith("<!doctype html>") and "a person waves" in page
+
+
+def test_motions_on_ones_own_character(run_server: Callable[..., Any], quick: Any, tmp_path: Path) -> None:
+    character(tmp_path / "hero.vrm", "vrm1")
+    with run_server(quick, rig=tmp_path / "hero.vrm") as served:
+        assert served.ask("GET", "/api/info").json["character"] == {"possible": True}
+        made = served.post("/api/generate", {**WAVE, "format": "rig"}).body
+        assert made.startswith(b"glTF") and b'"VRMC_vrm"' in made and b'"animations"' in made
+        page = served.post("/api/generate", {**WAVE, "format": "rig-page"}).body
+        assert re.search(rb'<script type="application/json" id="data">[^<]+</script>', page)
+    (tmp_path / "hero.vrm").write_bytes(b"no character")
+    with pytest.raises(UserError, match="not a GLB file"), run_server(quick, rig=tmp_path / "hero.vrm"):
+        pass
 
 
 def test_a_model_that_must_be_told_a_length_is_told_one(served: Any, quick: Any) -> None:
