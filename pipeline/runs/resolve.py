@@ -183,10 +183,8 @@ def _require_default(key: str, fields: object, where: str) -> None:
     if key != TRAINED and key not in kinds:
         raise UserError(f"{where}: defaults.{key}: no stage kind '{key}'{nearest(key, [TRAINED, *kinds])}")
     config: type[StageConfig] = TrainedStageConfig if key == TRAINED else kinds[key].config
-    train = fields.get("train") if isinstance(fields, dict) else None
-    if isinstance(train, dict):
-        train = {name: value for name, value in train.items() if name not in _LENGTH}
-        fields = {**fields, "train": train}
+    if isinstance(fields, dict) and isinstance(train := fields.get("train"), dict):
+        fields = {**fields, "train": {name: value for name, value in train.items() if name not in _LENGTH}}
     try:
         config.model_validate(fields)
     except ValidationError as error:
