@@ -321,7 +321,7 @@ def test_what_a_text_names_can_be_given(path: Path) -> None:
         keys += [key for row in rows.splitlines() for key in re.findall(r"`([a-z_.]+)`", row.split("|")[1])]
     assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]+\b", text)) <= known
     unknown = {key for key in keys if not SETTINGS.issuperset(key.split(".")[1:] or [key])}
-    assert unknown <= {"stage.field", "tokenizer"}  # any stage
+    assert unknown <= {"stage.field", "tokenizer", "train.epochs", "defaults.trained.train.clips"}
     recipes = re.findall(r"\b(?:humantomato|ude|baselines|t2m-gpt)-[a-z][a-z0-9-]*[a-z0-9]\b(?![./])", text)
     assert set(recipes) <= set(shipped_recipes())
 
