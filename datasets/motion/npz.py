@@ -78,7 +78,9 @@ def read_npy_header(stream: IO[bytes], where: str, size: int) -> ArrayHeader:
         raise UserError(
             f"{where}: object array (a pickle), which would run code when read; save plain numbers or text"
         )
-    if any(type(count) is not int or count < 0 for count in shape):
+    counted = all(type(count) is int and count >= 0 for count in shape)
+    # numpy counts no zero: nothing at all times too much is too much.
+    if not counted or math.prod(count or 1 for count in shape) * dtype.itemsize >= 2**62:
         raise UserError(f"{where}: the header states the size {list(shape)}")
     header = ArrayHeader(shape, dtype, stream.tell() - begin, fortran)
     if header.end != size:

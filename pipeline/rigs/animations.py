@@ -6,7 +6,6 @@ are not read.
 
 from __future__ import annotations
 
-import json
 import re
 import tempfile
 from collections.abc import Callable
@@ -91,15 +90,13 @@ def read_animation(path: Path, label: str) -> bytes:
     return _made(_text, rig, _number(path), label)
 
 
-def _made(make: Callable[[Rig, str], T], rig: Rig, number: int, label: str) -> T:
-    """What `make` makes of an animation's channels and samplers as JSON, by which a file that names one a
-    thousand times is read once.
-    """
+def _made(make: Callable[[Rig, int], T], rig: Rig, number: int, label: str) -> T:
+    """What `make` makes of an animation; `UserError` names the clip."""
     animations = _animations(rig.gltf)
     if not 0 <= number < len(animations):
         raise UserError(f"{label}: {Path(rig.gltf.where).name} has {len(animations)} animations")
     try:
-        return make(rig, json.dumps([animations[number].get(key) for key in ("channels", "samplers")]))
+        return make(rig, animations.index(animations[number]))  # the first of its equals
     except UserError as error:
         raise UserError(f"{label}: {error}") from None
     except (ArithmeticError, ValueError) as error:
@@ -107,9 +104,9 @@ def _made(make: Callable[[Rig, str], T], rig: Rig, number: int, label: str) -> T
 
 
 @lru_cache(maxsize=1)
-def _text(rig: Rig, animation: str) -> bytes:
-    """The BVH text of an animation."""
-    rotations, root, fps = _posed(rig, animation)
+def _text(rig: Rig, number: int) -> bytes:
+    """The BVH text of an animation, of which a file may have a thousand copies."""
+    rotations, root, fps = _posed(rig, number)
     with tempfile.TemporaryDirectory() as folder:
         write_bvh(Path(folder) / "clip.bvh", rig.skeleton, rotations, root, fps)
         return (Path(folder) / "clip.bvh").read_bytes()
@@ -147,9 +144,9 @@ def _number(path: Path) -> int:
     return int(found[0]) if found else -1
 
 
-def _posed(rig: Rig, animation: str) -> tuple[Floats, Floats, float]:
+def _posed(rig: Rig, number: int) -> tuple[Floats, Floats, float]:
     """Local rotations [T, J, 3, 3], root [T, 3] and frame rate of an animation on our joints."""
-    turns, places, fps = _played(rig, *json.loads(animation))
+    turns, places, fps = _played(rig, _animations(rig.gltf)[number])
     return (*_ours(rig, turns, places), fps)
 
 
@@ -169,13 +166,13 @@ def _ours(rig: Rig, turns: Floats, places: Floats) -> tuple[Floats, Floats]:
     return local, places @ rig.ahead.T / rig.unit
 
 
-def _played(rig: Rig, channels: Any, samplers: Any) -> tuple[Floats, Floats, float]:
+def _played(rig: Rig, animation: dict[str, Any]) -> tuple[Floats, Floats, float]:
     """World rotations of all nodes [T, N, 3, 3], places of the hips [T, 3], and the frame rate."""
     gltf = rig.gltf
     try:
         tracks = [
-            (int(one["target"]["node"]), str(one["target"]["path"]), samplers[one["sampler"]])
-            for one in channels
+            (int(one["target"]["node"]), str(one["target"]["path"]), animation["samplers"][one["sampler"]])
+            for one in animation["channels"]
             if one["target"].get("path") in ("rotation", "translation") and "node" in one["target"]
         ]
         read = {

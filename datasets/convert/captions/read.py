@@ -145,8 +145,13 @@ def _text_keys(keys: tuple[str, ...]) -> tuple[str, ...]:
     return next((keys for keys in found if keys), ())
 
 
+_MOST_RECORDS = 1000
+
+
 def joined(before: CaptionRow, row: CaptionRow) -> CaptionRow:
-    """One row of two records of the same clip."""
+    """One row of two records of the same clip; `UserError` for those beyond `_MOST_RECORDS`."""
+    if len(before.lines) >= _MOST_RECORDS:
+        raise UserError(f"{row.where}: clip '{row.id}' has {_MOST_RECORDS} records already")
     for what in ("file", "split"):
         old = getattr(before, what)
         new = getattr(row, what)

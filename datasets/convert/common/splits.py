@@ -66,6 +66,10 @@ def hash_share(clip_id: str) -> float:
     return int.from_bytes(hashlib.sha256(name).digest()[:8], "big") / 2**64
 
 
+_TOLD = 10
+"""Repeated lines of a list that a manifest names."""
+
+
 class ListLine(NamedTuple):
     """One line of a list or of a table of captions."""
 
@@ -106,7 +110,8 @@ def read_split_files(folder: Path) -> SplitLists:
     lines: list[ListLine] = []
     for split, path in files:
         ids, repeated = read_ids(path)
-        notes += [f"{line.place}: {line.reason}" for line in repeated]
+        notes += [f"{line.place}: {line.reason}" for line in repeated[:_TOLD]]
+        notes += [f"{path.name}: {len(repeated) - _TOLD} more such lines"] * (len(repeated) > _TOLD)
         lines += [*(ListLine(f"{path.name}:{number}", clip_id) for clip_id, number in ids.items()), *repeated]
         if not ids:
             raise UserError(f"{path}: no ids in it; delete the file if there is to be no split '{split}'")

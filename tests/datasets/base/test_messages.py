@@ -57,6 +57,8 @@ def test_what_numpy_torch_and_safetensors_make_of_a_disk(tmp_path: Path) -> None
             file.flush()
         os.dup2(os.open(os.devnull, os.O_WRONLY), file.fileno())
     assert "full" in str(sentence_of(error))
+    for error in (MemoryError(), raised(lambda: torch.empty(2**55))):
+        assert "out of memory" in str(sentence_of(error))
     error = raised(lambda: torch.save({"big": torch.zeros(1_000_000)}, FULL))
     assert "disk" in str(sentence_of(error)) and "full" in str(sentence_of(error))
     (tmp_path / "file").write_text("")

@@ -1,11 +1,16 @@
-"""Every command that writes, where it cannot: a file in the way, and a disk that takes no more.
+"""Every command that writes, where it cannot: a file in the way, closed folders, a disk that takes no more or
+cannot be read.
 
-The second is real: with a limit on the size of files the system refuses what goes beyond, in the middle of a
+The third is real: with a limit on the size of files the system refuses what goes beyond, in the middle of a
 write and for root too.
 """
 
 from __future__ import annotations
 
+import ctypes
+import errno
+import io
+import os
 import re
 import resource
 import shutil
@@ -43,6 +48,29 @@ def no_room(size: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@contextmanager
+def rights() -> Iterator[None]:
+    """Rights of files hold for root, too: without the capabilities DAC_OVERRIDE and DAC_READ_SEARCH."""
+    libc = ctypes.CDLL(None)
+    header = (ctypes.c_uint32 * 2)(0x20080522, 0)
+    before = (ctypes.c_uint32 * 6)()
+    libc.capget(header, before)
+    libc.capset(header, (ctypes.c_uint32 * 6)(before[0] & ~0b110, *before[1:]))
+    try:
+        yield
+    finally:
+        libc.capset(header, before)
+
+
+class BadDisk(io.FileIO):
+    """A file whose bytes do not come."""
+
+    def readinto(self, *_: object) -> int:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    read = readall = readinto  # type: ignore[assignment]
 
 
 WRITING: dict[str, Sequence[str]] = {
@@ -84,6 +112,55 @@ def test_a_file_in_the_way(name: str, places: Path, tmp_path: Path, call: Call) 
     error = require_sentence(call(*words_of(name, places, tmp_path / "file" / "below")))
     assert str(tmp_path / "file") in error
     assert files_of(tmp_path) == {tmp_path / "file"}
+
+
+@pytest.mark.parametrize("name", sorted(set(WRITING) - {"evaluate"}))
+def test_a_closed_folder(name: str, places: Path, tmp_path: Path, call: Call) -> None:
+    tmp_path.chmod(0o555)
+    with rights():
+        error = require_sentence(call(*words_of(name, places, tmp_path / "out")))
+    assert str(tmp_path) in error and "no permission" in error and not list(tmp_path.iterdir())
+
+
+TRAINED = ("run", "{root}/small.yaml", "--out", "{out}", "--until", "tokenizer")
+UNREAD = {
+    "newest checkpoint": (TRAINED, "30.ckpt"),
+    "statistics": (TRAINED, "stats.safetensors"),
+    "motion": (WRITING["data convert"], "a.bvh"),
+    "shard": (WRITING["data copy"], "train-000000.tar"),
+    "index": (WRITING["data report"], "index.npz"),
+}
+
+
+@pytest.mark.parametrize("why", ["disk", "rights"])
+@pytest.mark.parametrize("name", UNREAD)
+def test_what_cannot_be_read_is_no_damage(
+    name: str, why: str, places: Path, tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words, file = UNREAD[name]
+    for folder in ("run", "shards", "mocap"):
+        shutil.copytree(places / folder, tmp_path / folder)
+    out = tmp_path / ("run" if words is TRAINED else "out")
+    (tmp_path / "run/stages/tokenizer/artifact.json").unlink()
+    opened = io.open
+    if why == "rights":
+        for path in tmp_path.rglob(f"*{file}"):
+            path.chmod(0)
+    else:
+        bad = lambda path, mode="r", *rest, **how: (  # noqa: E731
+            io.BufferedReader(BadDisk(path)) if str(path).endswith(file) else opened(path, mode, *rest, **how)
+        )
+        monkeypatch.setattr(io, "open", bad)
+    before = files_of(tmp_path)
+    with rights():
+        given = [
+            word.replace("{root}/small", f"{places}/small").format(root=tmp_path, out=out) for word in words
+        ]
+        answer = call(*(word.replace(f"{tmp_path}/map", f"{places}/map") for word in given))
+    if (name, why) == ("motion", "rights"):  # one that is closed is left out, and said
+        assert answer.code == 0 and "1 unreadable file" in answer.out
+        return
+    assert file in require_sentence(answer) and files_of(tmp_path) >= before
 
 
 @pytest.mark.parametrize("name", sorted(set(WRITING) - {"table"}))
