@@ -103,8 +103,11 @@ def find_mismatch(requests: Sequence[Record], joints: NDArray[np.floating], fps:
     signals = signals_of(joints, fps)
     for request in requests:  # by their actions alone, whatever the attributes are
         bare = {"action": request["action"], "parts": [{"action": act} for act in actions_of(request)]}
-        walks = request["action"] == "walk" and _moved(signals) > WALKED and _action(signals) == "turn"
-        if walks or agrees(bare, joints, None, fps)["action"]:  # who turns on the way walks
+        seen = _action(signals)
+        walks = request["action"] == "walk" and _moved(signals) > WALKED and seen == "turn"
+        alike = {request["action"], seen}  # but for an upright body, or how far both arms go up
+        stretches = alike in ({"reach", "point"}, {"raise", "stretch"})
+        if walks or stretches or agrees(bare, joints, None, fps)["action"]:  # who turns on the way walks
             shown.append(request)
     if not shown:
         wanted = (" and then ".join(_NOUNS.get(act, act) for act in actions_of(one)) for one in requests)
@@ -163,11 +166,12 @@ def _action(s: Signals) -> str:
         return "crawl"
     if s.drop.max() > LYING:
         return "lie"
-    # Then who leaves the floor: runners fly too, so their pace is asked before their hops and jumps.
+    # Then who leaves the floor: runners fly too, so their pace is asked before their hops and jumps. No hop
+    # lifts the other foot to a kick's height, and who kicks may leave the floor a little.
     flights = len(_flights(s))
     if _pace(s) > 1.6 and (flights >= 2 or s.balls.max() > 0.13):
         return "run"
-    if flights and max(_hops(s)):
+    if flights and max(_hops(s)) and s.balls.max() < 0.55:
         return "hop"
     if flights and s.drop.min() < -0.05:
         return "jump"

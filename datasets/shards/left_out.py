@@ -25,7 +25,7 @@ DOUBTFUL = "doubtful motion: "
 
 _QUOTED = re.compile(r"'[^']*'")
 _NUMBER = re.compile(r"(?<![\w.])-?\d+(?:[.,]\d+)*(?:e[+-]?\d+)?")
-_FILE = re.compile(r"(?!m/s\b)[^\s'\",;()]*(?:/|\.[A-Za-z]\w{1,4}\b)[^\s'\",;:()]*")
+_FILE = re.compile(r"(?<!m)(?!m/s\b)[^\s'\",;()]*(?:/|\.[A-Za-z]\w{1,4}\b)[^\s'\",;:()]*")
 
 
 def drop(label: str, error: Exception) -> Dropped:

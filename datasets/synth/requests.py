@@ -44,8 +44,12 @@ _FINGERS = {
     "wave_fingers": rf"(?:wiggling|waving) the fingers of {_HAND}",
 }
 """Phrases about fingers by the shape of the hand; their side is not the action's."""
-_ANIMALS = r"(dog|cat|horse|bird|monkey|bear|lion|tiger|elephant|rabbit|cow|pig|fish|snake|robot)s?"
-"""Who is no person."""
+_FOREIGN = (
+    r"(dog|cat|horse|bird|monkey|bear|lion|tiger|elephant|rabbit|cow|pig|fish|snake|robot)s?"
+    r"|jumping jacks?|over (a|an|the) (?!head|shoulder|left|right|floor|ground)\w+|swim(s|ming)?|swam|stairs?|staircase|ladders?|hills?|slopes?|ramps?|escalators?"
+    r"|(wav|clap|lift|rais|punch)\w* (?:\w+ ){0,2}(foot|feet|legs?|knees?|toes?)"
+)
+"""Who is no person, what a flat floor without things does not allow, and an arm's action by a leg."""
 _COUNTED = ("kick", "punch", "hop", "jump", "squat", "clap")
 _ONES = "two three four five six seven eight nine ten eleven twelve"
 _TENS = "twenty thirty forty fifty sixty seventy eighty ninety"
@@ -71,7 +75,8 @@ class CaptionRequest:
 
 def parse_requests(caption: str) -> CaptionRequest:
     """Return what a caption asks for, as truth records that state no more than it does."""
-    text, hands = _without_hands(caption.lower())
+    text = re.sub(r"\b(a|one) minute\b", "60 seconds", caption.lower().replace("half a minute", "30 seconds"))
+    text, hands = _without_hands(text)
     parts = [part for part in (part.strip(" ,.") for part in re.split(_IN_TURN, text)) if part]
     named = [parse_actions(part) for part in parts]
     actions = tuple(action for own in named for action in own)
@@ -79,7 +84,7 @@ def parse_requests(caption: str) -> CaptionRequest:
         return CaptionRequest()
     if _has(text, _NEGATIONS):
         return CaptionRequest(refused=True, without=actions)
-    if len(actions) > 2 or _has(text, _ANIMALS):
+    if len(actions) > 2 or _has(text, _FOREIGN):
         return CaptionRequest(refused=True)
     lasting = re.search(rf"\bfor (?:about )?(\d+|{'|'.join(_NUMBERS)})[ -]seconds?\b", text)
     whole = hands | ({"seconds": _number(lasting[1])} if lasting else {})

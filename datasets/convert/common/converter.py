@@ -6,7 +6,9 @@ recipes and clusters find both by name (`convert/registry.py`).
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.licences import credits_of
-from motionloom.datasets.base.records import ClipMeta
+from motionloom.datasets.base.records import ClipMeta, Fault
 from motionloom.datasets.base.register import Table
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.planned import C, facts_of
+from motionloom.datasets.convert.common.planned import C, PlannedClip, facts_of, words_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.shards.sample import Sample
 
@@ -147,7 +149,20 @@ class Converter(ABC, Generic[Cfg, C]):
             has_face=face,
             mirror_of=mirror_of,
         )
-        return about if seen is None else about.model_copy(update={"faults": seen.faults(self.layout.fps)})
+        if seen is None:
+            return about
+        return about.model_copy(update={"faults": (*seen.faults(self.layout.fps), *_names(clip))})
+
+
+def _names(clip: PlannedClip) -> Iterator[Fault]:
+    """Captions of several words that are the file's name."""
+    name = " ".join(re.findall(r"[^\W_]+", clip.id.lower()))
+    for text in sorted(words_of(clip)):
+        words = " ".join(re.findall(r"[^\W_]+", text.lower()))
+        if " " in words and words in name:
+            yield Fault(
+                kind="caption is a name", text=f"'{text}' is the file's name, no sentence", weight=1.0
+            )
 
 
 AnyConverter = Converter[Any, Any]

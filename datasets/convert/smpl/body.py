@@ -20,7 +20,7 @@ from motionloom.datasets.audio.features import VERSION, AudioSettings, audio_fea
 from motionloom.datasets.audio.sound import read_sound, resample_sound, sound_seconds
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.memory import content_of
-from motionloom.datasets.base.records import Split
+from motionloom.datasets.base.records import Fault, Split
 from motionloom.datasets.convert.common.config import END_TOLERANCE
 from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.features import canonical_smpl75, features_of, require_human, upright
@@ -43,6 +43,8 @@ Wav = tuple[NDArray[np.float32], int]
 """Samples and their rate."""
 
 
+SILENT = 1e-3
+"""Largest sample of a sound that nobody hears: 60 dB below the loudest that a file holds."""
 SOURCE_FPS = 30.0
 """Frame rate of all these sets, where a file states none."""
 
@@ -231,7 +233,10 @@ class BodyRelease(Release[Cfg]):
                 self.sound_folder, clip.entry.sound, config.audio_settings(), config.fps, config.sound_rate
             )
             rows, wav = cut_of(config, piece, start, seconds)
-        meta = meta.model_copy(update={"song": self.song(clip)})
+        faults = meta.faults or ()
+        if wav is not None and np.abs(wav[0]).max(initial=0.0) < SILENT:
+            faults += (Fault(kind="silent", text="its sound is silent", weight=1.0),)
+        meta = meta.model_copy(update={"song": self.song(clip), "faults": faults})
         return Sample(meta, motion, texts=list(clip.entry.texts), audio=rows, wav=wav)
 
 
