@@ -103,9 +103,9 @@ def find_mismatch(requests: Sequence[Record], joints: NDArray[np.floating], fps:
     signals = signals_of(joints, fps)
     for request in requests:  # by their actions alone, whatever the attributes are
         bare = {"action": request["action"], "parts": [{"action": act} for act in actions_of(request)]}
-        seen = _action(signals)
-        walks = request["action"] == "walk" and _moved(signals) > WALKED and seen == "turn"
-        alike = {request["action"], seen}  # but for an upright body, or how far both arms go up
+        act = _action(signals)
+        walks = request["action"] == "walk" and _moved(signals) > WALKED and act == "turn"
+        alike = {request["action"], act}  # but for an upright body, or how far both arms go up
         stretches = alike in ({"reach", "point"}, {"raise", "stretch"})
         if walks or stretches or agrees(bare, joints, None, fps)["action"]:  # who turns on the way walks
             shown.append(request)

@@ -46,7 +46,8 @@ _FINGERS = {
 """Phrases about fingers by the shape of the hand; their side is not the action's."""
 _FOREIGN = (
     r"(dog|cat|horse|bird|monkey|bear|lion|tiger|elephant|rabbit|cow|pig|fish|snake|robot)s?"
-    r"|jumping jacks?|over (a|an|the) (?!head|shoulder|left|right|floor|ground)\w+|swim(s|ming)?|swam|stairs?|staircase|ladders?|hills?|slopes?|ramps?|escalators?"
+    r"|jumping jacks?|over (a|an|the) (?!head|shoulder|left|right|floor|ground)\w+"
+    r"|swim(s|ming)?|swam|stairs?|staircase|ladders?|hills?|slopes?|ramps?|escalators?"
     r"|(wav|clap|lift|rais|punch)\w* (?:\w+ ){0,2}(foot|feet|legs?|knees?|toes?)"
 )
 """Who is no person, what a flat floor without things does not allow, and an arm's action by a leg."""

@@ -38,7 +38,7 @@ def plan_bvh(
     if folder != config.source and folder.is_relative_to(config.source):
         draft.base = f"{folder.relative_to(config.source).as_posix()}/"
     maps = choose_maps(config, own_maps, draft, settings.maps)
-    draft.limit(lambda clip: clip.id)
+    draft.limit()
     if miscounted := [file.path for file in found if file.miscounted]:
         draft.notes.append(
             f"'Frames:' is a row off in {len(miscounted)} of the files (the first: {miscounted[0]}); "

@@ -26,7 +26,7 @@ from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.facts import parse_where, require_known
 from motionloom.datasets.convert.common.files import Walk
 from motionloom.datasets.convert.common.look import Look
-from motionloom.datasets.convert.common.planned import C, facts_of, file_of, words_of
+from motionloom.datasets.convert.common.planned import C, Totals, Words, facts_of, file_of, words_of
 from motionloom.datasets.convert.common.splits import ListLine
 from motionloom.datasets.shards.left_out import drop, grouped, grouped_notes
 
@@ -45,40 +45,6 @@ class NotTaken(NamedTuple):
     fate: Fate
     names: tuple[str, ...]
     """Its file and id."""
-
-
-@dataclass
-class Words:
-    """Clips with and without captions, where captions are wanted; by their labels."""
-
-    captioned: int = 0
-    """Clips that have them, and nothing against them."""
-    uncaptioned: list[str] = field(default_factory=list)
-    bare: list[str] = field(default_factory=list)
-    """Clips that lack nothing but captions."""
-    summary: str = ""
-    """Number of clips with captions, and those without, where the user brought captions."""
-
-
-@dataclass
-class Totals:
-    """Numbers of a finished plan."""
-
-    found: int = 0
-    """Motion files in the source."""
-    clips: int = 0
-    """Clips found, taken or not, and their hours."""
-    hours: float = 0.0
-    frames: dict[Split, int] = field(default_factory=dict)
-    """Expected frames a split, at the target frame rate."""
-    measured: dict[str, int] = field(default_factory=dict)
-    """The frames of clips that were converted to see what becomes of them, by their ids."""
-    licences: dict[str, int] = field(default_factory=dict)
-    """Clips to convert under each licence."""
-    bytes_needed: int | None = None
-    """Disk that the shards will take; None when unknown."""
-    count: Callable[[], None] = lambda: None
-    """Counts frames and licences again."""
 
 
 @dataclass
@@ -222,18 +188,19 @@ class ConversionPlan(Generic[C]):
         except Exception as error:  # whatever a bad file, name or number makes of the libraries below
             self.mark_unreadable(source, error)
 
-    def limit(self, key: Callable[[C], str]) -> None:
-        """Keep `config.limit` clips at most, chosen by a hash of their key, with a note of the choice."""
+    def limit(self) -> None:
+        """Keep `config.limit` clips at most, chosen by a hash of their ids, with a note of the choice."""
         most = self.config.limit
-        if most is not None and most < len(self.items):
-            self.notes.append(f"limited to {most} of {len(self.items)} clips")
-            kept = set(sorted(sha256_of_json(key(clip)) for _, clip in self.items)[:most])
-            for _, clip in self.items:
-                if sha256_of_json(key(clip)) not in kept:
-                    record = Dropped(source=clip.label(), reason=f"not among the {most} clips of the limit")
-                    self.not_ours.append(record)
-                    self.known.limited |= {clip.id, file_of(clip)}
-            self.items = [item for item in self.items if sha256_of_json(key(item[1])) in kept]
+        if most is None or most >= len(self.items):
+            return
+        self.notes.append(f"limited to {most} of {len(self.items)} clips")
+        kept = set(sorted((clip.id for _, clip in self.items), key=sha256_of_json)[:most])
+        for _, clip in self.items:
+            if clip.id not in kept:
+                record = Dropped(source=clip.label(), reason=f"not among the {most} clips of the limit")
+                self.not_ours.append(record)
+                self.known.limited |= {clip.id, file_of(clip)}
+        self.items = [item for item in self.items if item[1].id in kept]
 
     def finish(
         self, *, found: int, frames: Callable[[C], int], licence: Callable[[C], str]
@@ -394,17 +361,12 @@ class ConversionPlan(Generic[C]):
 
 def _given(config: ConvertConfig, walked: Walk) -> set[str]:
     """The entries that options name: a file, or all files of a folder."""
-    values = [value for key in type(config).model_fields for value in _each(getattr(config, key))]
-    paths = {value.absolute() for value in values if isinstance(value, Path) and value != config.source}
+    values = [getattr(config, key) for key in type(config).model_fields if key != "source"]
+    each = [one for value in values for one in (value if isinstance(value, tuple) else (value,))]
     source = config.source.absolute()
-    within = {path.relative_to(source).as_posix() for path in paths if path.is_relative_to(source)}
-    return {
-        name for name in walked.files if not within.isdisjoint([name, *map(str, PurePosixPath(name).parents)])
-    }
-
-
-def _each(value: object) -> Iterable[object]:
-    return value if isinstance(value, tuple) else (value,)
+    within = {one.absolute() for one in each if isinstance(one, Path)} - {source}
+    names = [(name, source / name) for name in walked.files]
+    return {name for name, path in names if not within.isdisjoint((path, *path.parents))}
 
 
 def _home(name: str) -> tuple[str, str]:

@@ -1,7 +1,9 @@
-"""A clip of a plan, and what is asked of it by name."""
+"""A clip of a plan, what is asked of it by name, and numbers of many."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Protocol, TypeVar
 
 from motionloom.datasets.base.records import Split
@@ -43,3 +45,37 @@ def file_of(clip: PlannedClip) -> str:
 def words_of(clip: PlannedClip) -> frozenset[str]:
     """The sentences of a clip."""
     return frozenset(text.text for text in getattr(clip, "texts", ()))
+
+
+@dataclass
+class Words:
+    """Clips with and without captions, where captions are wanted; by their labels."""
+
+    captioned: int = 0
+    """Clips that have them, and nothing against them."""
+    uncaptioned: list[str] = field(default_factory=list)
+    bare: list[str] = field(default_factory=list)
+    """Clips that lack nothing but captions."""
+    summary: str = ""
+    """Number of clips with captions, and those without, where the user brought captions."""
+
+
+@dataclass
+class Totals:
+    """Numbers of a finished plan."""
+
+    found: int = 0
+    """Motion files in the source."""
+    clips: int = 0
+    """Clips found, taken or not, and their hours."""
+    hours: float = 0.0
+    frames: dict[Split, int] = field(default_factory=dict)
+    """Expected frames a split, at the target frame rate."""
+    measured: dict[str, int] = field(default_factory=dict)
+    """The frames of clips that were converted to see what becomes of them, by their ids."""
+    licences: dict[str, int] = field(default_factory=dict)
+    """Clips to convert under each licence."""
+    bytes_needed: int | None = None
+    """Disk that the shards will take; None when unknown."""
+    count: Callable[[], None] = lambda: None
+    """Counts frames and licences again."""

@@ -207,7 +207,7 @@ class Release(Converter[Cfg, ReleaseClip]):
                 captioned = bool(clip.entry.texts)
                 keep = config.uncaptioned == "keep"
                 draft.add(clip, reason, captioned=captioned, wanted=config.has_captions, keep=keep)
-        draft.limit(lambda clip: clip.id)
+        draft.limit()
         return draft.finish(
             found=draft.totals.found or repeated + sum(state is not None for state in scanned.values()),
             frames=self.frames,

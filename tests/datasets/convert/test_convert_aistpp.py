@@ -205,6 +205,13 @@ def test_lengths_that_differ_are_cut_or_left_out(copy: Path) -> None:
 # ---- music of our own
 
 
+def test_silence_is_doubted(copy: Path) -> None:
+    samples, rate = soundfile.read(copy / "wavs/mHO9.wav")
+    soundfile.write(copy / "wavs/mHO9.wav", 1e-4 * samples, rate)
+    notes = prepare(AistppConfig(source=copy)).looked().plan.notes
+    assert ["mHO9" in note for note in notes if "sound is silent" in note] == [True]
+
+
 def test_a_band_plays_at_the_tempo_and_phase_of_the_dance(fixture: Path, tmp_path: Path) -> None:
     """The genuine dance: its tempo is heard in what plays, and beats where it stops; CC BY 4.0 alone."""
     try:

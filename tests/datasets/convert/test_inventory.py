@@ -207,3 +207,4 @@ def test_a_plan_is_the_conversion(name: str, shared: Path, tmp_path: Path) -> No
     frames = {split: sum(one.frames for one in manifest.shards if one.split == split) for split in SPLITS}
     assert plan.totals.frames == frames
     assert set(manifest.notes) <= set(plan.notes)
+    assert any("is the file's name" in note for note in plan.notes) is (name == "motionx")

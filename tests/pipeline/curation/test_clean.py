@@ -103,6 +103,7 @@ PLANTED: list[tuple[str, Callable[[Joints], Joints]]] = [
     ("no person", lambda joints: joints * 2.54),
     ("no person", lambda joints: canonicalize(joints * [1, -1, -1])),
     ("no person", stretched),
+    ("stands along the ground", lambda joints: joints[..., [0, 2, 1]] * [1, 1, -1]),
     ("frozen", frozen),
     *(
         ("flips", flipped(limb, n))
