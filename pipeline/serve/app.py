@@ -23,7 +23,7 @@ from motionloom.datasets.base.json_doors import parse_json
 from motionloom.datasets.base.register import discover
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.render.viewer import resource, viewer_script
-from motionloom.pipeline.serve.guard import Bodies, OwnPage, allowed_hosts
+from motionloom.pipeline.serve.guard import Bodies, OwnPage, WholeBodies, allowed_hosts
 from motionloom.pipeline.serve.part import SERVED, A
 from motionloom.pipeline.serve.requests import Answer, MotionRequest, Motions, ServeConfig, Sounds
 
@@ -83,6 +83,7 @@ class Site:
         return Starlette(
             routes=routes,
             middleware=[
+                Middleware(WholeBodies, patience=self.config.patience),
                 Middleware(TrustedHostMiddleware, allowed_hosts=hosts, www_redirect=False),
                 Middleware(OwnPage),
             ],

@@ -11,7 +11,7 @@ from __future__ import annotations
 import asyncio
 import ipaddress
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from typing import Any
 
 import h11
@@ -19,7 +19,7 @@ from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import JSONResponse
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from motionloom.datasets.base.errors import UserError
@@ -97,6 +97,36 @@ class Connection(H11Protocol):
             self._end = None
 
 
+class WholeBodies:
+    """Read and drop what still comes of a body before its request is answered, for `patience` seconds: a
+    client that has to close its connection while it sends sees a reset in place of the sentence (ASGI
+    middleware)."""
+
+    def __init__(self, app: ASGIApp, patience: float) -> None:
+        self.app = app
+        self.patience = patience
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        is_whole = False
+        end = asyncio.get_running_loop().time() + self.patience
+
+        async def reading() -> Message:
+            nonlocal is_whole
+            message = await receive()
+            is_whole = not message.get("more_body")
+            return message
+
+        async def sending(message: Message) -> None:
+            with suppress(TimeoutError):
+                async with asyncio.timeout_at(end):
+                    while not is_whole:
+                        await reading()
+            with suppress(h11.LocalProtocolError):  # what came was no HTTP: uvicorn has said so
+                await send(message)
+
+        await self.app(scope, reading, sending)
+
+
 class OwnPage:
     """Answer 403 to requests that a page of another site makes (ASGI middleware)."""
 
@@ -133,9 +163,7 @@ class Bodies:
     @asynccontextmanager
     async def read(self, request: Request, what: str, most: int) -> AsyncIterator[bytes]:
         """Give the body, at most `most` bytes; 413 as soon as it is larger, 408 after `patience` seconds, 503
-        where those of others, which wait or still come, take all memory that there is for bodies. What still
-        comes of one that is refused is read and dropped (`Connection`): a client whose connection is closed
-        while it sends sees a reset in place of the sentence.
+        where those of others, which wait or still come, take all memory that there is for bodies.
         """
         pieces = list[bytes]()
         size = 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import json
 import re
 import signal
@@ -178,8 +179,9 @@ def test_half_sent_headers_are_let_go(run_server: Callable[..., Any], quick: Any
 
 
 def test_uploads_over_the_limit_get_their_sentence(served: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    for path in ("/api/sounds", "/api/clips"):
-        got = served.ask("POST", path, bytes(40 << 20))
+    """Also where the client closes behind its request."""
+    for path, header in itertools.product(("/api/sounds", "/api/clips"), ({}, {"Connection": "close"})):
+        got = served.ask("POST", path, bytes(40 << 20), header)
         assert got.status == 413 and "larger than this server takes" in got.json["error"]
     monkeypatch.setattr(served.site._bodies, "most", 1000)
     got = served.ask("POST", "/api/sounds", bytes(1 << 20))
