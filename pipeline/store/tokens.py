@@ -127,7 +127,8 @@ class TokenCaptions:
         """The (row, first, count) of each caption of each of the `clips`."""
         starts = np.cumsum([0, *map(len, captions)])
         table = np.array([caption for own in captions for caption in own], dtype=np.int64)
-        return TokenCaptions(starts, *table.reshape(-1, 3).T.copy(), clips)
+        rows, first, count = table.reshape(-1, 3).T.copy()
+        return TokenCaptions(starts, rows, first, count, clips)
 
 
 @dataclass(frozen=True)
