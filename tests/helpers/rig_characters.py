@@ -131,15 +131,9 @@ def character(
             for bone, place in bones.items()
         ]
         groups = [{"name": "Joy", "presetName": "joy", "binds": [{"mesh": 0, "index": 0, "weight": 50}]}]
-        data["extensions"] = {
-            "VRM": {
-                "specVersion": "0.0",
-                "meta": {"title": "made"},
-                "materialProperties": [],
-                "humanoid": {"humanBones": old},
-                "blendShapeMaster": {"blendShapeGroups": groups},
-            }
-        }
+        about = {"specVersion": "0.0", "meta": {"title": "made"}, "materialProperties": []}
+        about |= {"humanoid": {"humanBones": old}, "blendShapeMaster": {"blendShapeGroups": groups}}
+        data["extensions"] = {"VRM": about}
         data["extensionsUsed"] = ["VRM"]
     write(path, data, blob.tobytes())
     return out
