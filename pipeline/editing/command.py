@@ -19,7 +19,10 @@ from motionloom.pipeline.store.files import require_folder
 
 def edit(
     run_folder: ModelFolder,
-    clip: Annotated[Path, typer.Argument(help="A .bvh of any human skeleton, or a .npz or .glb of ours.")],
+    clip: Annotated[
+        Path,
+        typer.Argument(help="A .bvh of any human skeleton, a character's .glb or .vrma, or an .npz of ours."),
+    ],
     task: Annotated[
         Path | None,
         typer.Option("--task", help="YAML: keep, caption, path, pins, seconds and more; see the docs."),

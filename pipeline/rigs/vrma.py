@@ -48,14 +48,16 @@ def write_vrma(path: Path, outputs: Outputs) -> None:
     frames = len(worn.root)
     lift = -float(body_for(skeleton).vertices[:, 1].min())
     # Players drop what a character has no bone for, and many have no upper chest: the chest takes its turns.
-    low, high = skeleton.index("spine2"), skeleton.index("spine3")
+    chest = skeleton.index("spine2")
+    high = skeleton.index("spine3")
     parents = list(skeleton.parents)
     offsets = skeleton.offsets + np.array([[0.0, lift, 0.0]] + [[0.0] * 3] * (len(skeleton) - 1))
     rotations = worn.rotations.copy()
-    rotations[:, high] = rotations[:, low] @ rotations[:, high]
+    rotations[:, high] = rotations[:, chest] @ rotations[:, high]
     offsets[[child for child, parent in enumerate(parents) if parent == high]] += offsets[high]
-    offsets[high], parents[high] = offsets[low], parents[low]
-    kept = [joint for joint in range(len(skeleton)) if joint != low]
+    offsets[high] = offsets[chest]
+    parents[high] = parents[chest]
+    kept = [joint for joint in range(len(skeleton)) if joint != chest]
     nodes: list[dict[str, Any]] = []
     for joint in kept:
         children = [row for row, child in enumerate(kept) if parents[child] == joint]

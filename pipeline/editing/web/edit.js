@@ -226,7 +226,7 @@ export function begin(page) {
   function take(file, alone) {
     if (!CLIP.test(file.name) && !alone) return false;
     if (!info.edit.possible) say(`${file.name}: ${info.edit.why}`, true);
-    else if (!CLIP.test(file.name)) say(`${file.name} is no motion that can be read here: drop a BVH, GLB or npz file`, true);
+    else if (!CLIP.test(file.name)) say(`${file.name} is no motion that can be read here: drop a BVH, GLB, VRMA or npz file`, true);
     else takeClip(file);
     return true;
   }

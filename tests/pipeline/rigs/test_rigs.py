@@ -178,9 +178,9 @@ def test_names_of_ones_own(tmp_path: Path) -> None:
         figure_options({"rig": "x.vrm"}, ["npz"])
     assert set(default_formats(["rig"])) - set(default_formats()) == {"rig", "rig-page"}
     assert figure_options({"rig": "x.vrm"}, ["rig-page"]).more == {"rig": "x.vrm"}
-    with pytest.raises(UserError, match="odd.glb: no node for pelvis"):
+    with pytest.raises(UserError, match=r"odd\.glb: no node for pelvis"):
         read_clip(tmp_path / "odd.glb")
-    with pytest.raises(UserError, match="hero.glb: a character without an animation"):
+    with pytest.raises(UserError, match=r"hero\.glb: a character without an animation"):
         read_clip(tmp_path / "hero.glb")
 
 
