@@ -145,7 +145,8 @@ class Conversion(Generic[C]):
 def _tried(converter: Converter[Any, C], motion_type: MotionType, clip: C) -> list[ClipMeta] | Dropped:
     """The facts of a clip's samples, or the reason why it has none."""
     item = ShardItem(clip.label(), "", clip)
-    task = ShardTask[C](Path(), clip.split, 0, (), converter.layout, motion_type, strict=False, fingerprint="")
+    layout = converter.layout
+    task = ShardTask[C](Path(), clip.split, 0, (), layout, motion_type, strict=False, fingerprint="")
     made = convert_item(task, converter.convert, item)
     if isinstance(made, Dropped):
         return made
