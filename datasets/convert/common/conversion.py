@@ -135,7 +135,11 @@ class Conversion(Generic[C]):
         work = partial(_tried, converter, config.motion_type)
         made = [*read_in_threads(work, clips, workers=how.workers, progress=how.progress)]
         tried = f"tried {len(clips):,} of {len(plan.items):,} clips, as a conversion reads them"
-        plan.reject(one for one in made if isinstance(one, Dropped))
+        failed = [one for one in made if isinstance(one, Dropped)]
+        if failed and len(clips) < len(plan.items):
+            all_failed = round(len(failed) * len(plan.items) / len(clips))
+            tried += f": {len(failed):,} cannot be converted, of all perhaps {all_failed:,}"
+        plan.reject(failed)
         metas = [meta for one in made if not isinstance(one, Dropped) for meta in one]
         plan.totals.measured = {meta.id: meta.frames for meta in metas}
         plan.totals.count()
