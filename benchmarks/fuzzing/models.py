@@ -140,7 +140,7 @@ def _diagnosis(folder: Path) -> Made:
         (folder / DETAILS).write_bytes(arrays)
         try:
             details = json.loads(content)
-        except ValueError:
+        except (ValueError, RecursionError):
             raise UserError("not JSON") from None
         return showings(folder, details)
 

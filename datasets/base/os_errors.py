@@ -36,7 +36,7 @@ _WORDS: dict[int, str] = {
 }
 
 NO_MORE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-_OF_THE_MACHINE = {*NO_MORE, errno.EMFILE, errno.ENFILE, errno.EIO, errno.ENOMEM}
+_OF_THE_MACHINE = {*NO_MORE, errno.EMFILE, errno.ENFILE, errno.EIO}
 
 _RUST = re.compile(r"\(os error (\d+)\)")
 _NUMPY_SHORT = re.compile(r"\d+ requested and \d+ written")
@@ -57,7 +57,7 @@ def of_the_machine(error: BaseException) -> bool:
     """Whether an error, or one that it was raised from, says that the machine is at its limits, whatever file
     was read or written."""
     found = (error, *_causes(error))
-    return any(isinstance(one, OSError) and one.errno in _OF_THE_MACHINE for one in found)
+    return any(lacks_memory(one) or getattr(one, "errno", None) in _OF_THE_MACHINE for one in found)
 
 
 def lacks_memory(error: BaseException) -> bool:
@@ -73,7 +73,8 @@ def naming(path: Path | str, *instead: object) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno is not None and error.filename in (None, *instead):
+        named = error.filename if error.filename2 is None else error.filename2  # of a copy, what it makes
+        if error.errno is not None and named in (None, *instead):
             error.filename = str(path)
             if error.filename2 is not None:
                 error.filename2 = None

@@ -138,9 +138,9 @@ class NpzFile:
             self._zip = zipfile.ZipFile(path)
         except (OSError, zipfile.BadZipFile, NotImplementedError, ValueError) as error:
             system = error.__context__ or error  # zipfile takes a disk that cannot be read for another file
-            bad = isinstance(system, OSError)
-            why = f"cannot be read ({system.strerror or system})" if bad else "not an .npz file, or cut off"
-            raise UserError(f"{self.label}: {why}") from None
+            if isinstance(system, OSError):
+                raise UserError(f"{self.label}: cannot be read ({system.strerror or system})") from None
+            raise UserError(f"{self.label}: not an .npz file, or cut off") from None
         self._map: mmap.mmap | None = None
         names = [name for name in self._zip.namelist() if name.endswith(".npy")]
         self.names = frozenset(name.removesuffix(".npy") for name in names)

@@ -249,8 +249,6 @@ def convert_item(task: ShardTask[T], convert: Convert[T], item: ShardItem[T]) ->
         ]
     except DropClip as decision:
         return Dropped(source=label, reason=str(decision))
-    except MemoryError:
-        raise
     except Exception as error:  # a converter meets whatever a bad file makes of its libraries
         failed = drop(label, error)
         if task.strict:

@@ -97,10 +97,8 @@ def _made(make: Callable[[Rig, int], T], rig: Rig, number: int, label: str) -> T
         raise UserError(f"{label}: {Path(rig.gltf.where).name} has {len(animations)} animations")
     try:
         return make(rig, animations.index(animations[number]))  # the first of its equals
-    except UserError as error:
-        raise UserError(f"{label}: {error}") from None
-    except (ArithmeticError, ValueError) as error:
-        raise UserError(f"{label}: an animation whose numbers are no motion ({error})") from None
+    except (UserError, ArithmeticError, ValueError) as error:
+        raise UserError(f"{label}: no motion can be read ({error})") from None
 
 
 @lru_cache(maxsize=1)

@@ -67,7 +67,7 @@ class Rig:
         """The character of a GLB or VRM file; `own` is a JSON file of names."""
         try:
             return Rig._of(Gltf.read(path), path, own)
-        except (ArithmeticError, np.linalg.LinAlgError) as error:
+        except (ArithmeticError, ValueError) as error:
             raise UserError(f"{path}: a character whose bones are none ({error})") from None
 
     @staticmethod

@@ -205,7 +205,7 @@ def load_known(folder: Path) -> tuple[KnownTexts, dict[str, KnownCaptions]]:
     try:
         require_plain(embeddings)
         arrays = load_file(embeddings)
-    except (OSError, SafetensorError, TypeError, AttributeError) as error:  # types that numpy does not know
+    except (OSError, SafetensorError, TypeError, ValueError, AttributeError) as error:  # of odd types, sizes
         raise UserError(
             f"{embeddings}: cannot be read ({error}); delete it and {texts.name}, which only say what the "
             f"model knows, or copy the whole folder again"

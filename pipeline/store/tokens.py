@@ -90,7 +90,7 @@ class TokenStore:
             tensors = load_file(path)
             starts = tensors["starts"].numpy()
             whole = tensors["whole"].numpy()
-        except (SafetensorError, KeyError, TypeError) as error:
+        except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
             raise UserError(f"{path}: cannot be read ({error}); run the tokens stage again") from None
         codes = {k.removeprefix("codes."): v for k, v in tensors.items() if k.startswith("codes.")}
         if set(codes) != set(per_group):

@@ -32,7 +32,7 @@ from torch import Tensor
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import HashingFile, atomic_file, remove_temporaries, sync_folder
 from motionloom.datasets.base.json_doors import require_plain
-from motionloom.datasets.base.os_errors import lacks_memory, of_the_machine
+from motionloom.datasets.base.os_errors import naming, of_the_machine
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import Means, StageModule
 from motionloom.pipeline.training.metric_log import LogState
@@ -204,7 +204,7 @@ def write_checkpoint(checkpoint: object, path: Path) -> None:
 def read_checkpoint(path: Path) -> Checkpoint:
     """Return the content of a checkpoint, its tensors mapped from disk; `DamagedError` if it is damaged.
 
-    A disk or a memory that fails, or a forbidden file, says nothing of it: that is a `UserError`.
+    A disk or a memory that fails, or a forbidden file, says nothing of it: those errors pass.
     """
     try:
         _check_seal(path)
@@ -212,11 +212,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
     except DamagedError:
         raise
     except Exception as error:  # a torn file fails in many ways, all of which mean the same
-        if isinstance(error, PermissionError) or of_the_machine(error) or lacks_memory(error):
-            raise UserError(
-                f"{path}: the checkpoint cannot be read ({getattr(error, 'strerror', None) or error}); mend "
-                f"that and give the same command again, or delete it to go on from the one before"
-            ) from None
+        if isinstance(error, PermissionError) or of_the_machine(error):
+            raise
         raise DamagedError(f"cannot be read ({type(error).__name__})") from None
     if not isinstance(content, dict):
         raise DamagedError(f"holds a {type(content).__name__} and no checkpoint")
@@ -266,7 +263,7 @@ class _Sink(HashingFile):
 
 def _check_seal(path: Path) -> None:
     require_plain(path)
-    with path.open("rb") as file:
+    with naming(path), path.open("rb") as file:
         # The seal comes last, so a file that was cut short has none, wherever it was cut.
         size = file.seek(0, 2) - _SEAL_BYTES
         file.seek(max(0, size))

@@ -111,7 +111,6 @@ def read_split_files(folder: Path) -> SplitLists:
     for split, path in files:
         ids, repeated = read_ids(path)
         notes += [f"{line.place}: {line.reason}" for line in repeated[:_TOLD]]
-        notes += [f"{path.name}: {len(repeated) - _TOLD} more such lines"] * (len(repeated) > _TOLD)
         lines += [*(ListLine(f"{path.name}:{number}", clip_id) for clip_id, number in ids.items()), *repeated]
         if not ids:
             raise UserError(f"{path}: no ids in it; delete the file if there is to be no split '{split}'")

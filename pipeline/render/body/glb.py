@@ -281,8 +281,6 @@ def read_glb(path: Path) -> tuple[RigidMotion, float, str]:
     from scipy.spatial.transform import Rotation
 
     try:
-        if raw[:4] != b"glTF":
-            raise ValueError("no GLB")
         gltf = GLTF2.from_json(about)
         blob = raw[end + 8 :]
         nodes = [gltf.nodes[node] for node in gltf.skins[0].joints]

@@ -73,9 +73,8 @@ def test_killed_inside_an_upload(command: str, tmp_path: Path, monkeypatch: pyte
                 return process.wait()
 
         if command == "copy":
-            words = [tmp_path / "set" if word == "{bucket}" else word for word in COMMANDS["convert"]]
-            line = [sys.executable, "-P", "-m", "motionloom", *words]
-            subprocess.run(line, cwd=tmp_path, check=True)  # type: ignore[arg-type]
+            words = [word.format(bucket=tmp_path / "set") for word in COMMANDS["convert"]]
+            subprocess.run([sys.executable, "-P", "-m", "motionloom", *words], cwd=tmp_path, check=True)
         assert start(0, "s3://shards/whole") == 0
         puts = {"run": (3, 9, 1, 4), "convert": (0, 2, 1), "copy": (0, 3, 2)}[command]
         codes = [start(at, "s3://shards/killed", put) for at, put in enumerate(puts, start=1)]
