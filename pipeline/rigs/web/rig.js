@@ -218,7 +218,7 @@ window.motionloomRig = async (root, data) => {
       const targets = (part.targets || []).map((target) => (target.POSITION === undefined ? null : values(target.POSITION)));
       const skin = node.skin === undefined ? null : gltf.skins[node.skin];
       parts.push({
-        node: number, vao, count: index.length, position, points: buffers[0], targets, skin,
+        node: number, vao, count: index.length, position, points: buffers[0], targets, skin, joints: given[3][0], shares: given[4][0],
         bind: skin && skin.inverseBindMatrices !== undefined ? values(skin.inverseBindMatrices) : null,
         bones: skin ? gl.createTexture() : null,
         texture: await texture(colour.baseColorTexture?.index), colour: colour.baseColorFactor || [1, 1, 1, 1],
@@ -236,6 +236,20 @@ window.motionloomRig = async (root, data) => {
   gl.enableVertexAttribArray(0);
   gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 0, 0);
 
+  // It may be taller than a grown person of its legs: what is drawn of its first moment says.
+  let size = data.size;
+  if (motions.length) pose(motions[0], 0);
+  for (const { node, skin, bind, position, joints, shares } of motions.length ? parts : []) {
+    for (let k = 0; k < position.length / 3; k += 7) {
+      const four = [0, 1, 2, 3].map((n) => shares[k * 4 + n]);
+      const joint = joints[k * 4 + four.indexOf(Math.max(...four))];
+      const world = skin ? nodes[skin.joints[joint]].world : nodes[node].world;
+      const m = skin && bind ? multiply(world, bind.subarray(joint * 16, joint * 16 + 16)) : world;
+      const [x, y, z] = position.subarray(k * 3, k * 3 + 3);
+      size = Math.min(Math.max(size, 1.05 * (m[1] * x + m[5] * y + m[9] * z + m[13])), 3 * data.size);
+    }
+  }
+
   let turn = 0.7;
   let tilt = 0.12;
   let far = 1;
@@ -251,7 +265,6 @@ window.motionloomRig = async (root, data) => {
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.enable(gl.DEPTH_TEST);
     // The camera looks at the hips from around, as far away as the character is tall.
-    const size = data.size;
     const hips = nodes[data.hips].world;
     const at = [hips[12], size * 0.5, hips[14]];
     const away = size * 1.9 * far;
