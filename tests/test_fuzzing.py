@@ -35,6 +35,17 @@ def test_what_is_not_in_the_table_is_told(fuzz: Any, monkeypatch: pytest.MonkeyP
     assert "no reader covers pipeline/training/checkpointing.py (torch.load" in lacking
 
 
+@pytest.mark.parametrize("seeds", [[], [b"some"]])
+def test_a_reader_without_a_seed_or_a_mutator_ends_the_run(
+    fuzz: Any, seeds: list[bytes], tmp_path: Path
+) -> None:
+    table = sys.modules["fuzzing.table"]
+    made = table.of_files(tmp_path, "toy", seeds, lambda random, content, other: content, Path.read_bytes)
+    toy = table.Reader("toy", lambda folder: made)
+    with pytest.raises(AssertionError, match="toy: no seeds, or one that no mutator changes"):
+        sys.modules["fuzzing.worker"].Worker(toy, 0, tmp_path).run(0, 10)
+
+
 @pytest.mark.slow
 def test_500_damaged_inputs_of_each_reader_end_in_a_sentence(
     fuzz: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -101,6 +101,8 @@ class Worker:
             with tempfile.TemporaryDirectory(prefix="fuzz-", dir=_QUICK) as folder, _inside(Path(folder)):
                 # Seeds are made here, once: a child that died may have left its folder as it was.
                 seeds, read = self.reader.make(Path(folder))
+                if not seeds or not all(map(_is_changed, seeds)):
+                    raise AssertionError(f"{self.reader.name}: no seeds, or one that no mutator changes")
                 for seed in seeds:  # that which is whole is read, and what is loaded once is loaded
                     _genuine(self.reader.name, seed, read)
                 died = False
@@ -215,6 +217,15 @@ class Worker:
         words = "".join(c if c.isalnum() else "-" for c in f"{self.reader.name} {place}")[:120]
         if len(list(self.failing.glob(f"{words}.*"))) < _KEPT:
             (self.failing / f"{words}.{number}.{Path(seed.file).name}").write_bytes(content)
+
+
+def _is_changed(seed: Seed) -> bool:
+    """Whether the mutator of a seed makes another content of it."""
+    for number in range(20):
+        with suppress(ArithmeticError, ValueError, LookupError, RecursionError):
+            if seed.damage(Random(number), seed.content, seed.content) != seed.content:
+                return True
+    return False
 
 
 def _genuine(name: str, seed: Seed, read: Read) -> None:
