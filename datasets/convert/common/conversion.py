@@ -198,7 +198,7 @@ def run_conversion(
             return writer.write(conversion.converter.convert)
         finally:
             if part is None and (out / MANIFEST_FILE).is_file():
-                made = Manifest.load_json(out / MANIFEST_FILE)
+                made = load_manifest(out)
                 plan.reject(made.dropped[len(plan.left_out()) :])
                 write_left_out(out, [*made.dropped, *plan.not_ours])
 
