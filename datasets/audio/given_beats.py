@@ -89,7 +89,7 @@ def _times(piece: Sound, said: str, name: str) -> Times:
             times = np.array(data["beats"] if isinstance(data, dict) else data, dtype=np.float64)
         else:
             times = np.array(said.replace(",", " ").split(), dtype=np.float64)
-    except (ValueError, TypeError, KeyError):
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
         raise UserError(f"{name}: neither a file nor beats; {_HOW}") from None
     steps = np.diff(times)
     if times.ndim != 1 or not np.isfinite(times).all() or (steps <= 0).any():
