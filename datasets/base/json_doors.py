@@ -36,7 +36,10 @@ def open_plain(path: Path, name: str = "") -> BinaryIO:
 
 def require_plain(path: Path, name: str = "") -> int:
     """Bytes of a plain file; `UserError` for a device or a pipe, which would be waited for without end."""
-    about = path.stat()
+    try:
+        about = path.stat()
+    except ValueError:  # a zero byte, in a name that another file says
+        raise UserError(f"{name or ascii(str(path))}: no file can have this name") from None
     if not stat.S_ISREG(about.st_mode):
         raise UserError(f"{name or path}: not a plain file")
     return about.st_size

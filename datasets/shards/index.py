@@ -254,6 +254,14 @@ def _index_problem(index: SplitIndex, shards: list[ShardInfo]) -> str | None:
     ends = index.id_ends
     if ends[0] < 0 or (np.diff(ends) < 0).any() or ends[-1] != len(index.id_bytes):
         return "the clip ids are damaged"
+    if index.id_bytes.max(initial=0) > 127:  # of letters beyond ASCII, none may be cut in two
+        begins = index.id_bytes[ends[:-1][ends[:-1] < ends[-1]]]
+        try:
+            index.id_bytes.tobytes().decode()
+        except UnicodeDecodeError:
+            return "the clip ids are damaged"
+        if (begins >> 6 == 0b10).any():
+            return "the clip ids are damaged"
     if (samples < 1).any():
         return "a shard of the manifest has no samples"
     # Compared once for all clips, so that reading one needs no checks.
