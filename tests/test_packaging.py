@@ -70,8 +70,8 @@ def imports(tree: ast.Module) -> set[tuple[str, bool]]:
 
 BEHIND_AN_EXTRA = ("pipeline/serve",)
 """Rooms that a function imports, which says in a sentence which extra is missing: all in them is optional."""
-OF_THE_SERVER = ROOT / "pipeline/editing/served.py"
-"""A part that only the server imports, from a table."""
+OF_THE_SERVER = [ROOT / f"pipeline/{room}/served.py" for room in ("editing", "rigs")]
+"""Parts that only the server imports, from a table."""
 
 
 def uses() -> dict[tuple[str, bool], set[str]]:
@@ -79,7 +79,7 @@ def uses() -> dict[tuple[str, bool], set[str]]:
     owners = packages_distributions()
     found: dict[tuple[str, bool], set[str]] = {}
     for path in sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")):
-        behind = path.parent.relative_to(ROOT).as_posix() in BEHIND_AN_EXTRA or path == OF_THE_SERVER
+        behind = path.parent.relative_to(ROOT).as_posix() in BEHIND_AN_EXTRA or path in OF_THE_SERVER
         for name, own in imports(ast.parse(path.read_text(encoding="utf-8"))):
             inside = own or behind
             if name == "motionloom" or name in sys.stdlib_module_names:
@@ -100,7 +100,7 @@ def test_every_import_is_declared() -> None:
 def test_rooms_behind_an_extra_are_imported_in_functions(room: str) -> None:
     module = f"motionloom.{room.replace('/', '.')}"
     for path in (path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")):
-        if path.parent == ROOT / room or path == OF_THE_SERVER:
+        if path.parent == ROOT / room or path in OF_THE_SERVER:
             continue
         for node in ast.parse(path.read_text(encoding="utf-8")).body:
             names = [getattr(node, "module", None) or "", *(a.name for a in getattr(node, "names", ()))]
