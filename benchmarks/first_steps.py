@@ -32,7 +32,7 @@ import os, sys, warnings
 from pathlib import Path
 import motionloom
 from motionloom import MotionModel
-from motionloom.pipeline.inference.captioning import captions
+from motionloom.pipeline.curation.captioning import captions
 warnings.simplefilter('ignore')
 root, entered = str(Path(motionloom.__file__).resolve().parent) + os.sep, set()
 def enter(frame, event, _):

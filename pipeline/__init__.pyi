@@ -2,7 +2,6 @@ from .contract.generation import Prompt as Prompt
 from .contract.sampling import SamplingConfig as SamplingConfig
 from .contract.stage import StageKind as StageKind
 from .evaluation.clip_metrics import ClipMetric as ClipMetric
-from .inference.captioning import captions as captions
 from .inference.files.outputs import write_motions as write_motions
 from .inference.files.writers import Writer as Writer
 from .inference.model import MotionModel as MotionModel

@@ -17,3 +17,4 @@ _KINDS = {
 
 for _folder, _names in _KINDS.items():
     declare("stage kind", dict.fromkeys(_names, f"motionloom.pipeline.baselines.{_folder}.stage"))
+declare("stage kind", {"evaluate_captions": "motionloom.pipeline.baselines.tm2t.evaluate_captions"})

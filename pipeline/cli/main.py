@@ -22,7 +22,6 @@ import typer
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.os_errors import sentence_of
 from motionloom.datasets.base.register import discover
-from motionloom.pipeline.cli.caption import caption
 from motionloom.pipeline.cli.data import data_app
 from motionloom.pipeline.cli.evaluate import evaluate
 from motionloom.pipeline.cli.generate import generate
@@ -158,9 +157,6 @@ def run(
 
 
 app.command()(generate)
-app.command()(caption)
-
-
 app.command()(evaluate)
 
 

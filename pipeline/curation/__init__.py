@@ -1,1 +1,1 @@
-"""Searching a data set by words or likeness, and cleaning it: suspects on a page to decide about."""
+"""Searching a data set by words or likeness, cleaning it by a page of suspects, and captions of clips."""

@@ -10,6 +10,7 @@ declare(
     "command",
     {
         "search": f"{_HERE}.search_command",
+        "caption": f"{_HERE}.caption_command",
         "data add": f"{_HERE}.add_command",
         "data clean": f"{_HERE}.clean_command",
     },

@@ -20,7 +20,6 @@ _KINDS = {
     "networks.utt": ("utt",),
     "networks.ude": ("ude",),
     "results.evaluate": ("evaluate",),
-    "results.evaluate_captions": ("evaluate_captions",),
     "results.evaluate_dances": ("evaluate_dances",),
     "results.generate": ("generate",),
     "results.report": ("report",),

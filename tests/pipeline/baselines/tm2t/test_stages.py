@@ -19,9 +19,9 @@ from motionloom.datasets.motion.body.rigid import fit_rigid
 from motionloom.datasets.motion.bvh.motion import write_bvh
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.pipeline.curation.captioning import CaptionedClip, captions
 from motionloom.pipeline.evaluation.figures import COMMON_CAPTION, MODEL, NEAREST, OWN_CAPTION, FigureFile
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.captioning import CaptionedClip, captions
 from motionloom.pipeline.inference.generation import generate
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.request import Request

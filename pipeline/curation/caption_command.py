@@ -10,7 +10,9 @@ import typer
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.records import Dropped
+from motionloom.datasets.base.register import register
 from motionloom.pipeline.cli.options import At, Device, ModelFolder
+from motionloom.pipeline.contract.command import Command
 from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.store.files import require_file_place
 
@@ -44,7 +46,7 @@ def caption(
     """
     from motionloom.datasets.base.files import write_text
     from motionloom.pipeline.contract.stage import CAPTIONER
-    from motionloom.pipeline.inference.captioning import captions
+    from motionloom.pipeline.curation.captioning import captions
     from motionloom.pipeline.inference.model import MotionModel
     from motionloom.pipeline.runs.snapshot import run_at
 
@@ -76,3 +78,6 @@ def caption(
     if out is not None:
         write_text(out, "".join(f"{json.dumps(one.record(), ensure_ascii=False)}\n" for one in found))
         say(console, f"{out}: {len(found)} clips")
+
+
+register(Command("caption", caption))

@@ -5,8 +5,12 @@ from __future__ import annotations
 from pydantic import Field
 
 from motionloom.datasets.base.progress import Meter
+from motionloom.pipeline.baselines.tm2t.caption_figures import (
+    CaptionedClips,
+    caption_figures,
+    trivial_captions,
+)
 from motionloom.pipeline.contract.stage import CAPTIONER, StageConfig, StageContext, register
-from motionloom.pipeline.evaluation.captions import CaptionedClips, caption_figures, trivial_captions
 from motionloom.pipeline.evaluation.figures import MODEL, OWN_CAPTION, FigureFile, facts
 from motionloom.pipeline.evaluation.truth import digest_of, spread, truth_of
 from motionloom.pipeline.stages.results.evaluation import Evaluation, EvaluationStage
