@@ -6,6 +6,7 @@ loudness are then the piece's, not the cut's.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -17,14 +18,15 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from motionloom.datasets.audio.features import VERSION, AudioSettings, audio_features, rows_at
-from motionloom.datasets.audio.sound import read_sound, resample_sound, sound_seconds
+from motionloom.datasets.audio.same_sound import NO_LANDMARKS, Landmarks, landmarks, same_pieces
+from motionloom.datasets.audio.sound import Sound, read_sound, resample_sound, sound_seconds
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.memory import content_of
 from motionloom.datasets.base.records import Fault, Split
 from motionloom.datasets.convert.common.config import END_TOLERANCE
 from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.features import canonical_smpl75, features_of, require_human, upright
-from motionloom.datasets.convert.common.files import inside
+from motionloom.datasets.convert.common.files import inside, read_in_threads
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
 from motionloom.datasets.convert.smpl.smpl_npz import read_motion, read_motion_header
@@ -178,11 +180,24 @@ class BodyRelease(Release[Cfg]):
             if clip.entry.sound is not None:
                 content = content_of(self.sound_folder / clip.entry.sound)
                 heard.setdefault(content, {}).setdefault(clip.entry.sound, split)
-        return [
-            f"{' and '.join(names)} are one piece of music, in {', '.join(sorted(set(names.values())))}"
-            for names in heard.values()
-            if len(names) > 1
-        ] + super().copies(plan)
+        of_one = [list(names) for names in heard.values() if len(names) > 1]
+        splits = {name: split for names in heard.values() for name, split in names.items()}
+        if self.config.look and len(set(splits.values())) > 1:  # by their sound too, once for the same bytes
+            names = [next(iter(same)) for same in heard.values()]
+            made = read_in_threads(self._landmarks, names, workers=os.cpu_count() or 1, progress=False)
+            of_one += map(list, same_pieces(dict(zip(names, made, strict=True))))
+        notes = []
+        for names in of_one:
+            places = ", ".join(sorted({splits[name] for name in names}))
+            notes.append(f"{' and '.join(names)} are one piece of music, in {places}")
+        return notes + super().copies(plan)
+
+    def _landmarks(self, sound: str) -> Landmarks:
+        """What a sound is known by; nothing where it cannot be read, as its clips' reason says."""
+        try:
+            return landmarks(Sound.read(self.sound_folder / sound))
+        except UserError:
+            return NO_LANDMARKS
 
     def song(self, clip: ReleaseClip) -> str | None:
         """Name of what is heard; clips with the same one dance to the same piece."""

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from motionloom.datasets.audio.features import AudioSettings, audio_features, beats
+from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.records import Manifest
 from motionloom.datasets.check.dataset import check
@@ -175,6 +176,16 @@ def test_music_goes_with_the_motion(fixture: Path, tmp_path: Path) -> None:
     onset = audio[:, 52]
     times = np.flatnonzero(onset > 0.5 * onset.max()) / 60
     assert np.abs((times + 0.375) % 0.75 - 0.375).max() < 0.06
+
+
+def test_a_song_in_two_splits_is_said(fixture: Path, shared: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(fixture, copy)
+    song = Sound.read(shared / "data/music/calmrace-ks.ogg", rate=22_050).samples[: 22_050 * 20]
+    for name, samples in {"mBR0": song, "mHO9": 0.3 * song[7000:]}.items():
+        soundfile.write(copy / f"wavs/{name}.wav", samples, 22_050)
+    notes = prepare(AistppConfig(source=copy)).looked().plan.notes
+    assert "mBR0.wav and mHO9.wav are one piece of music, in test, train" in notes
 
 
 def test_music_analysed_at_its_own_rate(fixture: Path, tmp_path: Path) -> None:
