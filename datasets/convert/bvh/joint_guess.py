@@ -221,7 +221,7 @@ def _trunk(figure: _Figure, legs: tuple[Limb, Limb], arms: tuple[Limb, Limb]) ->
     if head is not None:
         necks = [chest] if hung else figure.way(chest, figure.parents[head])
         # An ASF's lower neck begins where the collars do: a neck is above them.
-        collar = figure.way(chest, shoulders[0])[0]
+        collar = next(iter(figure.way(chest, shoulders[0])), chest)
         if len(necks) > 1 and figure.length(necks[0], collar) < _SAME_PLACE * figure.extent:
             del necks[0]
         rows |= {"head": (head,), "neck": tuple(necks[:1]) or (chest, head, head)}
