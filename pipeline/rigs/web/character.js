@@ -7,11 +7,17 @@ const one = (id) => document.getElementById(id);
 /* The part of a page (`serve.js`). */
 export function begin(page) {
   const section = one("character"), show = one("character-show"), save = one("character-save");
+  const plain = { opened: false, able: false, tell() {}, take: () => false, refresh() {} };
+  if (!page.info.character.possible) {
+    section.remove();
+    save.remove();
+    return plain;
+  }
   let drawn = null; // what the page saves, of which the character shows the motion
 
   async function refresh() {
     const asked = page.asked;
-    save.hidden = !page.info.character.possible || !asked;
+    save.hidden = !asked;
     if (section.hidden || !asked || asked === drawn) return;
     drawn = asked;
     try {
@@ -30,5 +36,5 @@ export function begin(page) {
     section.scrollIntoView({ block: "nearest" });
   });
   for (const button of save.querySelectorAll("[data-kind]")) button.addEventListener("click", () => page.keep(button.dataset.kind));
-  return { opened: false, able: false, tell() {}, take: () => false, refresh };
+  return { ...plain, refresh };
 }

@@ -75,13 +75,13 @@ def test_killed_inside_an_upload(command: str, tmp_path: Path, monkeypatch: pyte
         if command == "copy":
             words = [word.format(bucket=tmp_path / "set") for word in COMMANDS["convert"]]
             subprocess.run([sys.executable, "-P", "-m", "motionloom", *words], cwd=tmp_path, check=True)
-        assert start(0, "s3://shards/whole") == 0
+        assert start(0, f"s3://shards/{command}-whole") == 0
         puts = {"run": (3, 9, 1, 4), "convert": (0, 2, 1), "copy": (0, 3, 2)}[command]
-        codes = [start(at, "s3://shards/killed", put) for at, put in enumerate(puts, start=1)]
+        codes = [start(at, f"s3://shards/{command}-killed", put) for at, put in enumerate(puts, start=1)]
         assert codes == [-signal.SIGKILL] * len(puts)
-        start(7, "s3://shards/killed", seconds=6)
-        assert start(8, "s3://shards/killed") == 0
-        whole = kept("s3://shards/whole", tmp_path / "a")
-        assert len(whole) > 5 and kept("s3://shards/killed", tmp_path / "b") == whole
-        sent = network.puts
-        assert start(9, "s3://shards/killed", 0) == 0 and network.puts == 0 < sent, "nothing is sent again"
+        start(7, f"s3://shards/{command}-killed", seconds=6)
+        assert start(8, f"s3://shards/{command}-killed") == 0
+        whole = kept(f"s3://shards/{command}-whole", tmp_path / "a")
+        assert len(whole) > 5 and kept(f"s3://shards/{command}-killed", tmp_path / "b") == whole
+        assert start(9, f"s3://shards/{command}-killed", 0) == 0
+        assert network.puts == 0, "nothing is sent again"
