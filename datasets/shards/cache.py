@@ -82,7 +82,7 @@ class FileCache:
             cached = self.find(name)
             if cached is not None:
                 return cached
-            self._make_room(size)
+            alone = self._make_room(size)
             part = path.with_name(f".{name}{_PART}")
             try:
                 make(part)
@@ -91,12 +91,16 @@ class FileCache:
                 part.replace(path)
             finally:
                 part.unlink(missing_ok=True)
-        self._make_room(0, keep=name)
+        if not alone:  # what others were fetching has grown since; alone, one look at the folder is enough
+            self._make_room(0, keep=name)
         return file
 
-    def _make_room(self, size: int, keep: str = "") -> None:
-        """Delete temporary files of killed processes, and the oldest files until `size` bytes fit."""
+    def _make_room(self, size: int, keep: str = "") -> bool:
+        """Delete temporary files of killed processes, and the oldest files until `size` bytes fit; whether
+        nobody else is fetching a file.
+        """
         files = []
+        alone = True
         used = size
         with os.scandir(self.folder) as entries:
             for entry in entries:
@@ -106,6 +110,7 @@ class FileCache:
                     continue
                 if part:  # of a killed download, unless somebody holds its lock
                     with self._lock(whole, wait=False) as mine:
+                        alone = alone and mine
                         if mine:
                             (self.folder / entry.name).unlink(missing_ok=True)
                 try:
@@ -120,6 +125,7 @@ class FileCache:
                 break
             (self.folder / name).unlink(missing_ok=True)
             used -= length
+        return alone
 
     @contextmanager
     def _lock(self, name: str, *, wait: bool = True) -> Iterator[bool]:

@@ -161,7 +161,9 @@ def _place_of(parts: Sequence[str], stages: Mapping[str, Any]) -> str:
     for group, config in (("optim", OptimConfig), ("train", TrainConfig)):
         own = parts[1:] if parts[0] == group else parts
         if trained and len(own) == 1 and own[0] in config.model_fields:
-            return f"; did you mean '{trained[-1]}.{group}.{own[0]}'?"
+            key = f"{group}.{own[0]}"
+            some = " or ".join(f"{name}.{key}" for name in trained[:3])
+            return f"; say for which training: {some}; or defaults.{TRAINED}.{key} for all that state none"
     return ""
 
 
