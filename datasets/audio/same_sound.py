@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
 
 from motionloom.datasets.audio.sound import Sound
 
@@ -22,6 +23,10 @@ _PAIRS, _LATEST = 5, 128
 """Each peak is paired with so many that follow, at most so many frames (2 s) later."""
 _COMMON = 50
 """Landmarks that more places have say nothing: a drum, a tone that is held."""
+LONGEST = 600.0
+"""Seconds from its beginning that are known of a sound, in some 200 MB."""
+_AT_ONCE = 2048
+"""Frames that are transformed at once."""
 SHARED = 0.05
 """Share of the shorter file's landmarks that two files of one piece have in common at least [ours]."""
 _LEAST = 20
@@ -41,13 +46,14 @@ NO_LANDMARKS = Landmarks(np.empty(0, np.int64), np.empty(0, np.int64))
 
 def landmarks(sound: Sound) -> Landmarks:
     """The landmarks of a sound; none of silence."""
-    from scipy.ndimage import maximum_filter
-
-    samples = sound.resampled(RATE).samples
+    beginning = sound if sound.seconds <= LONGEST else sound.slice(0, LONGEST)
+    samples = beginning.resampled(RATE).samples
     if len(samples) < FFT:
         return NO_LANDMARKS
     windows = np.lib.stride_tricks.sliding_window_view(samples, FFT)[::HOP]
-    power = np.abs(np.fft.rfft(windows * np.hanning(FFT).astype(np.float32), axis=1)).T
+    bell = np.hanning(FFT).astype(np.float32)
+    starts = range(0, len(windows), _AT_ONCE)
+    power = np.concatenate([np.abs(np.fft.rfft(windows[at : at + _AT_ONCE] * bell)) for at in starts]).T
     # Peaks, and none of what is 60 dB below the loudest: that is a codec's own.
     peaks = (power == maximum_filter(power, size=_NEAR)) & (power > 1e-3 * power.max())
     frames, bins = np.nonzero(peaks.T)

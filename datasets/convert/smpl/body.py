@@ -6,7 +6,6 @@ loudness are then the piece's, not the cut's.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -36,6 +35,8 @@ from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.shards.sample import Sample
 
 SOUND_SUFFIXES = (".wav", ".flac", ".mp3", ".ogg")
+_LISTENERS = 4
+"""Threads that look for one piece of music in two files; each takes at most some 200 MB."""
 FINGERS_MOVE = 1e-3
 """Radians. Fingers that turn less than this over a clip were not captured, but set to one pose."""
 _KEPT_PIECES = 64
@@ -184,7 +185,7 @@ class BodyRelease(Release[Cfg]):
         splits = {name: split for names in heard.values() for name, split in names.items()}
         if self.config.look and len(set(splits.values())) > 1:  # by their sound too, once for the same bytes
             names = [next(iter(same)) for same in heard.values()]
-            made = read_in_threads(self._landmarks, names, workers=os.cpu_count() or 1, progress=False)
+            made = read_in_threads(self._landmarks, names, workers=_LISTENERS, progress=False)
             of_one += map(list, same_pieces(dict(zip(names, made, strict=True))))
         notes = []
         for names in of_one:
