@@ -205,7 +205,7 @@ one("more").open = window.innerWidth > 620 && window.innerHeight > 500;
   for (const name of info.parts) parts.push((await import(`./${name}.js`)).begin(page));
   one("start-words").textContent = info.examples.length ? "It knows, for example:" : "What you ask for is shown here.";
   one("start-examples").replaceChildren(...choices(info.examples));
-  start.hidden = false;
+  start.hidden = Boolean(shown); // who was quick sees a motion already
   one("credits").textContent = info.credits.join(" ");
   if (!matchMedia("(pointer: coarse)").matches) one("caption").focus(); // a phone would open its keyboard over the page
 })();
