@@ -1,4 +1,4 @@
-"""What a million clips cost a GPT's start, and a training that reads them from S3.
+"""Measure a GPT's start at a million clips, and a training that reads them from S3.
 
     python benchmarks/growth_run.py WORK gpt                 # the first rank of a machine, and another
     python benchmarks/growth_run.py WORK s3 --steps 300      # two nodes, each with a cache of a tenth

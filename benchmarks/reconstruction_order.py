@@ -310,7 +310,7 @@ def train_group(trainings: list[Training], begin: float, args: argparse.Namespac
 
 
 def read_rows(args: argparse.Namespace) -> dict[tuple[str, int, int], dict[str, Any]]:
-    """What was measured: (arm, step, seed) -> row; of a seed that was begun twice, the later."""
+    """Return the measured rows by (arm, step, seed); of a seed that was begun twice, the later."""
     path = args.work / "rows.jsonl"
     lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
     rows = [json.loads(line) for line in lines]

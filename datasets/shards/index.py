@@ -88,7 +88,7 @@ class ShardIndex(Config):
     clips: list[ClipEntry]
     dropped: list[Dropped]
     doubts: list[Dropped] = Field(default_factory=list)
-    """What the judge of motion has found in its clips."""
+    """Faults that the judge of motion has found in its clips."""
     made_on: str = ""
     """Kinds of processor on which the clips were made: last digits may differ between them."""
 

@@ -229,7 +229,7 @@ def _read_index(tar: Path, changed: int) -> tuple[set[str], dict[str, list[ClipE
 
 
 def doubts_of(meta: ClipMeta) -> list[Dropped]:
-    """What the judge of motion has found in a clip."""
+    """Return the faults that the judge of motion has found in a clip."""
     return [Dropped(source=meta.source, reason=fault.text) for fault in meta.faults or ()]
 
 

@@ -91,7 +91,7 @@ def read_animation(path: Path, label: str) -> bytes:
 
 
 def _made(make: Callable[[Rig, int], T], rig: Rig, number: int, label: str) -> T:
-    """What `make` makes of an animation; `UserError` names the clip."""
+    """Return what `make` returns for an animation; `UserError` names the clip."""
     animations = _animations(rig.gltf)
     if not 0 <= number < len(animations):
         raise UserError(f"{label}: {Path(rig.gltf.where).name} has {len(animations)} animations")

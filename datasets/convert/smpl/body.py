@@ -194,7 +194,7 @@ class BodyRelease(Release[Cfg]):
         return notes + super().copies(plan)
 
     def _landmarks(self, sound: str) -> Landmarks:
-        """What a sound is known by; nothing where it cannot be read, as its clips' reason says."""
+        """Return the landmarks of a sound; none where it cannot be read, as its clips' reason says."""
         try:
             return landmarks(Sound.read(self.sound_folder / sound))
         except UserError:
