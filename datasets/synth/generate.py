@@ -40,6 +40,7 @@ from motionloom.datasets.synth.choreography import choreograph, dancing_face, da
 from motionloom.datasets.synth.dances import Dance, DanceConfig, DanceTruth, dance, plan_dance
 from motionloom.datasets.synth.hands_and_face import express, grip_hand, shape_hand
 from motionloom.datasets.synth.music.recording import PLAYED, player, render_song, song_features
+from motionloom.datasets.synth.stances import PACE, Poses, settle
 
 CONVERTER_VERSION = 3  # runs in a circle, four jumps, who sits and then waves
 LICENCE = "CC0-1.0"
@@ -72,6 +73,8 @@ ANIMATORS: dict[str, Animator] = {
     "crawl": floor.crawl,
     "stretch": arms.lift,
 }
+UNPACED = ("jump", "hop", "run", "dance")
+"""What gravity or music paces."""
 
 
 class SynthConfig(Config):
@@ -94,6 +97,9 @@ class SynthConfig(Config):
     wordings: Wordings = "few"
     """Words that captions are made of: two or three for each thing in sentences of one form, or a dozen in
     many forms, for models that shall take more words than their training's. Dances of `dances` have few."""
+    poses: Poses = "few"
+    """How people stand and how quick they are: arms hanging, for half a second before and after an action,
+    all at one pace; or each as she likes and at her own, cut where she moves. Dances of `dances` have few."""
     hold_out: list[Record] = Field(default_factory=list)
     """Combinations of truth values kept for testing, for example `[{"action": "kick", "side": "left"}]`."""
     hold_out_val: list[Record] = Field(default_factory=list)
@@ -182,7 +188,11 @@ def make_clip(index: int, config: SynthConfig) -> Clip:
         track = choreograph(planned.song, begin, planned.frames, layout.fps, motion)
     else:
         span = Span(config.min_seconds, config.max_seconds)
-        track = animate(truth, span, layout.fps, motion)
+        everyday = config.poses == "everyday"
+        pace = motion.uniform(*PACE) if everyday else 1.0
+        track = animate(truth, span, layout.fps, motion, pace)
+        if everyday and truth.action != "dance":
+            track = settle(track, config.min_seconds, motion)
     if hands and planned:
         track.fingers = dancing_hands(planned.song, begin, track.t, shape)
     elif hands and not truth.parts:
@@ -232,16 +242,23 @@ def captions_of(index: int, config: SynthConfig) -> tuple[list[str], list[str]]:
     return texts, face_texts if layout.has("face") else []
 
 
-def animate(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Track:
-    """The body of one action, or of two in turn with their hands."""
+def animate(truth: Truth, span: Span, fps: float, rng: np.random.Generator, pace: float = 1.0) -> Track:
+    """The body of one action, or of two in turn with their hands, `pace` times as quick as usual."""
     if truth.parts is None:
-        return ANIMATORS[truth.action](truth, span, fps, rng)
+        if truth.action in UNPACED:
+            return ANIMATORS[truth.action](truth, span, fps, rng)
+        # At another frame rate, whose frames are then taken for those of `fps`.
+        slow = replace(span, low=span.low * pace, high=span.high * pace)
+        track = ANIMATORS[truth.action](truth, slow, fps / pace, rng)
+        track.t = track.t / pace
+        track.fps = fps
+        return track
     # Each is as long as half of the span allows; the second begins where the first has ended.
     before, after = truth.parts
     half = Span(1.9, 0.5 * (span.high + OVERLAP), returns=True)
     seated = before.action == "sit" and after.action in SEATED
-    first = animate(before, replace(half, returns=not seated), fps, rng)
-    second = animate(after, replace(half, returns=after.action != "sit"), fps, rng)
+    first = animate(before, replace(half, returns=not seated), fps, rng, pace)
+    second = animate(after, replace(half, returns=after.action != "sit"), fps, rng, pace)
     if seated:
         second.hold_lower_body(first)
     track = joined(first, second)

@@ -13,10 +13,11 @@ from motionloom.datasets.actions.measure import action_of, agrees
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.shards.reader import ShardDataset
-from motionloom.datasets.synth.actions.truth import ACTIONS, BASIC, SEATED, draw
+from motionloom.datasets.synth.actions.truth import ACTIONS, BASIC, SEATED, Span, draw
 from motionloom.datasets.synth.generate import (
     Clip,
     SynthConfig,
+    animate,
     make_clip,
     make_sample,
     split_of,
@@ -55,6 +56,38 @@ def test_captions_are_true(clips: list[Clip], verdicts: list[dict[str, bool]]) -
     rates = {key: float(np.mean(values)) for key, values in right.items()}
     wrong = {key: rate for key, rate in rates.items() if rate < (0.99 if key[0] == "all" else 0.92)}
     assert not wrong
+
+
+def test_people_stand_as_they_like_and_captions_stay_true() -> None:
+    config = SynthConfig(seed=3, actions="all", poses="everyday", fps=20)
+    made = [make_clip(index, config) for index in range(200)]
+    verdicts = [agrees(clip.truth, clip.joints, clip.face, 20.0) for clip in made]
+    assert np.mean([all(verdict.values()) for verdict in verdicts]) >= 0.99
+    for clip in made:
+        assert 2 <= len(clip.joints) / 20 <= config.max_seconds
+        speed = 20 * np.linalg.norm(np.diff(clip.joints[:, :22], axis=0), axis=-1).max(1)
+        assert max(speed[:10].max(), speed[-10:].max()) > 0.25, "stands still at both ends"
+        assert clip.joints[:, [10, 11], 1].min() > -0.02, "a foot below the floor"
+    few = [make_clip(index, CONFIG) for index in range(200)]
+    spread, alike = (
+        np.std([one.joints[0, 20] - one.joints[0, 16] for one in ones], 0) for ones in (made, few)
+    )
+    assert (spread > 1.3 * alike)[[0, 2]].all()  # aside and ahead of the shoulder
+
+
+def test_a_person_has_a_pace_that_leaves_gravity_alone() -> None:
+    for action in ("bow", "jump"):
+        truth = draw(action, np.random.default_rng(1))
+        slow, quick = (
+            np.abs(
+                np.diff(
+                    animate(truth, Span(2.0, 2.0), FPS, np.random.default_rng(1), pace).solve()[:, 15], axis=0
+                )
+            )
+            for pace in (0.9, 1.1)
+        )
+        assert (quick.max() > 1.05 * slow.max()) == (action == "bow")
+        assert np.array_equal(quick, slow) == (action == "jump")
 
 
 @pytest.mark.parametrize("layout", ["body133", "wholebody313"])
