@@ -189,10 +189,10 @@ def top_of(room: str) -> str:
 
 
 READERS = {
-    "synth": "pipeline/cli/data pipeline/stages/data pipeline/evaluation pipeline/inference/checks "
-    "pipeline/songs pipeline/baselines/tm2t/caption_figures datasets/convert/aistpp",
+    "synth": "pipeline/cli/data pipeline/stages/data pipeline/evaluation pipeline/songs "
+    "datasets/convert/aistpp",
     "actions": "datasets/synth pipeline/stages/data pipeline/evaluation pipeline/inference/checks "
-    "pipeline/baselines/tm2t/caption_figures",
+    "pipeline/baselines/tm2t/caption_figures pipeline/curation/requests",
 }
 """Who may import the synthetic source, and the rules on joints that know its actions."""
 

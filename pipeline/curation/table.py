@@ -1,4 +1,4 @@
-"""The commands of this folder: which module registers each."""
+"""The commands of this folder and its reader of captions: which module registers each."""
 
 from __future__ import annotations
 
@@ -15,3 +15,4 @@ declare(
         "data clean": f"{_HERE}.clean_command",
     },
 )
+declare("reader of captions", {"english": f"{_HERE}.requests"})

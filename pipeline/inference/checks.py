@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.actions.dances import longest_stand
 from motionloom.datasets.actions.measure import actions_of, find_mismatch
+from motionloom.datasets.actions.requests import CaptionRequest, read_caption, words_of_actions
 from motionloom.datasets.base.printable import printable
-from motionloom.datasets.synth.requests import CaptionRequest, parse_actions, parse_requests
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.store.known_captions import Unknown
@@ -96,11 +96,11 @@ def _is_known(source: TextSource, caption: str) -> bool | None:
 
 def _suits(caption: str, other: str) -> bool:
     """Whether a caption may be named beside another: not for an action that this one takes back."""
-    return not set(parse_requests(caption).without) & set(parse_actions(other.lower()))
+    return not set(read_caption(caption).without) & words_of_actions(other)
 
 
 def _request(source: TextSource, caption: str) -> CaptionRequest | None:
     """Return what a caption asks for; None where it names no action of the training."""
-    request = parse_requests(caption)
+    request = read_caption(caption)
     named = {action for candidate in request.candidates for action in actions_of(candidate)}
     return request if request.refused or (named and named <= set(source.actions)) else None

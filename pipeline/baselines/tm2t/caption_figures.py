@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from motionloom.datasets.actions.measure import find_mismatch
+from motionloom.datasets.actions.requests import read_caption
 from motionloom.datasets.shards.clips import ClipDataset
-from motionloom.datasets.synth.requests import parse_requests
 from motionloom.models.metrics.captions import bert_score, bleu, cider_d, rouge_l, words_of
 from motionloom.models.metrics.retrieval import r_precision
 from motionloom.pipeline.evaluation.estimate import row_estimates, weighted
@@ -86,7 +86,7 @@ class CaptionedClips:
             }
             if truth.truth is not None:
                 # Rules on joints know the actions of clips that state their truth, and no others.
-                claims = parse_requests(captions[row]).candidates
+                claims = read_caption(captions[row]).candidates
                 holds = bool(claims) and find_mismatch(claims, truth.joints, self.fps) is None
                 found["captions.claims_decided"] = float(bool(claims))
                 found |= weighted("captions.claims_hold", float(holds), float(bool(claims)))

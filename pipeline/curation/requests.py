@@ -1,18 +1,19 @@
 """Parse captions for the actions of the synthetic source, by patterns of English [ours].
 
-`parse_requests` is all that others use. A linear probe on sentence embeddings was tried in its place; the
+A linear probe on sentence embeddings was tried in its place; the
 figures of both are in docs/results.md.
 """
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import yaml
 
 from motionloom.datasets.actions.dances import Record
+from motionloom.datasets.actions.requests import CaptionReader, CaptionRequest
+from motionloom.datasets.base.register import register
 
 _TABLE = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8"))
 _PATTERNS: dict[str, str] = _TABLE["actions"]
@@ -59,19 +60,6 @@ _NUMBERS |= {word: n for n, word in enumerate(_ONES.split(), 2)}
 _NUMBERS |= {word: 10 * n for n, word in enumerate(_TENS.split(), 2)}
 _NOT_TIMES = r"(?! ?(?:hand|arm|fist|leg|knee|degree|step|second|minute|person)s?\b| ?(?:feet|people)\b)"
 """A number before one of these is not how often."""
-
-
-@dataclass(frozen=True)
-class CaptionRequest:
-    """Truth records with what a caption asks for, the likelier first; none where it names no action.
-
-    `refused` is set where it takes an action back, or asks for more than two.
-    """
-
-    candidates: tuple[Record, ...] = ()
-    refused: bool = False
-    without: tuple[str, ...] = ()
-    """Actions that it takes back."""
 
 
 def parse_requests(caption: str) -> CaptionRequest:
@@ -177,3 +165,6 @@ def _number(word: str) -> int:
 def _has(text: str, pattern: str) -> bool:
     """Whether a text has one of these words."""
     return re.search(rf"\b({pattern})\b", text) is not None
+
+
+register(CaptionReader("english", parse_requests, lambda caption: parse_actions(caption.lower())))

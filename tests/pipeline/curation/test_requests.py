@@ -7,8 +7,9 @@ from typing import Any
 import pytest
 
 from motionloom.datasets.actions.measure import actions_of, find_mismatch
+from motionloom.datasets.actions.requests import CaptionRequest
 from motionloom.datasets.synth.generate import Clip, SynthConfig, make_clip
-from motionloom.datasets.synth.requests import CaptionRequest, parse_actions, parse_requests
+from motionloom.pipeline.curation.requests import parse_actions, parse_requests
 
 CONFIG = SynthConfig(clips=400, seed=3, actions="all")
 FPS = CONFIG.motion_layout.fps
