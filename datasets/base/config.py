@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Self, get_args
 
@@ -108,6 +109,23 @@ def require_local(place: object) -> None:
                 f"this machine's files; `motionloom data copy` carries data sets there and back, and stages "
                 f"of kind `shards` read them there"
             )
-    elif isinstance(place, list | tuple | Config):
-        for one in place.__dict__.values() if isinstance(place, Config) else place:
+    elif isinstance(place, list | tuple):
+        for one in place:
             require_local(one)
+    elif isinstance(place, Config):
+        for name in _with_paths(type(place)):
+            require_local(getattr(place, name))
+
+
+@cache
+def _with_paths(model: type[Config]) -> tuple[str, ...]:
+    """Fields that may hold a path: most records have none, and a data set has millions of records."""
+    return tuple(name for name, field in model.model_fields.items() if _holds_path(field.annotation))
+
+
+def _holds_path(annotation: Any) -> bool:
+    """Whether a field's type is, or is made of, one that may be a path."""
+    if inner := get_args(annotation):
+        return any(map(_holds_path, inner))
+    plain = (str, int, float, bool, type(None))
+    return annotation is Any or (isinstance(annotation, type) and annotation not in plain)

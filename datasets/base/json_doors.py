@@ -56,10 +56,9 @@ def parse_json(raw: str | bytes, where: str, **how: Any) -> Any:
     half of a letter, which nothing can be written with. `RecursionError` bounds the depth. Figures of ours
     may be NaN: `parse_constant=float` lets them.
     """
-    rules: dict[str, Any] = {"parse_float": _finite, "parse_int": _of_64_bits, "parse_constant": _finite}
     try:
         text = raw.decode() if isinstance(raw, bytes) else raw
-        found = json.loads(text, **rules | how)
+        found = json.JSONDecoder(**_RULES | how).decode(text) if how else _DECODER.decode(text)
         (json.dumps(found, ensure_ascii=False) if _HALF_LETTER.search(text) else text).encode()
     except UnicodeEncodeError:
         raise UserError(f"{where}: not valid JSON (half of a letter, a lone surrogate)") from None
@@ -80,6 +79,9 @@ def _of_64_bits(text: str) -> int:
     return value
 
 
+_RULES: dict[str, Any] = {"parse_float": _finite, "parse_int": _of_64_bits, "parse_constant": _finite}
+_DECODER = json.JSONDecoder(**_RULES)
+"""Made once: for a caption, making one takes as long as decoding it."""
 MOST = 1e9
 """No count of frames and no time in seconds is larger."""
 

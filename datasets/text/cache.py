@@ -97,7 +97,8 @@ class TextCache:
 
     def places(self, captions: Sequence[str]) -> dict[str, NDArray[np.int64]]:
         """The rows [n] of captions by which `sentences` and `similarities` find theirs."""
-        return {"sentence": self._rows(captions), "similarity": (self._other or self)._rows(captions)}
+        rows = self._rows(captions)
+        return {"sentence": rows, "similarity": rows if self._other is None else self._other._rows(captions)}
 
     def sentences(self, rows: NDArray[np.int64]) -> CaptionVectors:
         """`sentence` of the captions of these rows, by number."""
