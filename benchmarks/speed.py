@@ -150,9 +150,8 @@ def paper_batches(folder: str) -> dict[str, Numbered[Batch]]:
     per_group = {"body": 2, "hand": 1}
     codes = {k: torch.randint(512, (count * groups * n,), generator=draw) for k, n in per_group.items()}
     store = TokenStore(codes, np.arange(count + 1) * groups, per_group, np.ones(count, bool))
-    captions = TokenCaptions.of(
-        [[(3 * i + k, 0, groups) for k in range(3)] for i in range(count)], np.arange(count)
-    )
+    rows = np.array([(row, 0, groups) for row in range(3 * count)])
+    captions = TokenCaptions.of(np.full(count, 3), rows, np.arange(count))
     latents = torch.zeros(3 * count, 256)
     alike = torch.zeros(3 * count, NoiseText.dim)
     pattern = ("body", "body", "hand")

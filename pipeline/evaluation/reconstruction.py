@@ -28,7 +28,6 @@ from motionloom.datasets.base.records import HANDS
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import BODY_JOINTS, FINGERS, WRISTS
 from motionloom.datasets.motion.npz import NpzFile
-from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.models.metrics.reconstruction import JointErrors, joint_errors, mpjpe
 from motionloom.pipeline.contract.units import Row
 from motionloom.pipeline.evaluation.estimate import row_estimates, weighted
@@ -43,8 +42,8 @@ from motionloom.pipeline.evaluation.figures import (
     Protocol,
     group_figures,
 )
-from motionloom.pipeline.evaluation.reference_baselines import NearestClip, local_joints
-from motionloom.pipeline.evaluation.truth import Truth, reconstruct_all, reconstruct_truth
+from motionloom.pipeline.evaluation.reference_baselines import local_joints
+from motionloom.pipeline.evaluation.truth import Truth, reconstruct_all
 from motionloom.pipeline.store.networks import TrainedTokenizer
 
 _CLIP_ROWS = {"": MODEL, "_nearest_train_clip": NEAREST, "_mean_pose": STILL}
@@ -141,18 +140,6 @@ def _by_row(
         end = max((end for end in rows if name.endswith(end)), key=len)
         out[rows[end]][f"{prefix}.{name.removesuffix(end)}"] = value
     return out
-
-
-def reconstruction_errors(
-    tokenizer: TrainedTokenizer, train: ClipDataset, truths: Sequence[Truth]
-) -> dict[str, float]:
-    """Mean errors over all clips of `truths` in mm, by the names of `clip_errors`."""
-    nearest = NearestClip(train).motions(truths)
-    rows = [
-        clip_errors(tokenizer, near, truth, reconstruct_truth(tokenizer, truth))
-        for truth, near in zip(truths, nearest, strict=True)
-    ]
-    return {name: one.value for name, one in row_estimates([rows]).items()}
 
 
 def published_errors(motion: Tensor, real: Tensor) -> dict[str, JointErrors]:

@@ -13,7 +13,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -27,7 +28,8 @@ from torch.utils.data import Dataset
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import atomic_path
-from motionloom.datasets.loading.crops import CaptionSpan, caption_spans
+from motionloom.datasets.base.pool import Workers, usable_cores
+from motionloom.datasets.loading.crops import caption_spans
 from motionloom.datasets.loading.plan import ALONE, BatchPlan, Share
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.shards.clips import ClipDataset, Source
@@ -37,6 +39,8 @@ from motionloom.pipeline.store.data import captions_of
 from motionloom.pipeline.store.files import made_once
 
 Codes = dict[str, Tensor]
+_OF_A_WORKER = 2**15
+"""Clips whose captions a process of its own reads: it takes seconds to start."""
 
 
 @dataclass(frozen=True)
@@ -123,12 +127,9 @@ class TokenCaptions:
         return len(self.clips)
 
     @staticmethod
-    def of(captions: Sequence[Sequence[tuple[int, int, int]]], clips: NDArray[np.int64]) -> TokenCaptions:
-        """The (row, first, count) of each caption of each of the `clips`."""
-        starts = np.cumsum([0, *map(len, captions)])
-        table = np.array([caption for own in captions for caption in own], dtype=np.int64)
-        rows, first, count = table.reshape(-1, 3).T.copy()
-        return TokenCaptions(starts, rows, first, count, clips)
+    def of(counts: NDArray[np.int64], captions: NDArray[np.int64], clips: NDArray[np.int64]) -> TokenCaptions:
+        """So many of the `captions`, (row, first, count) [m, 3], are of each of the `clips`."""
+        return TokenCaptions(np.append(0, counts.cumsum()), *captions.T.copy(), clips)
 
 
 @dataclass(frozen=True)
@@ -316,15 +317,18 @@ def gpt_clips(
         )
 
     def read() -> dict[str, Any]:
+        parts = np.array_split(np.stack([clips, store.groups[clips]]), -(-len(clips) // _OF_A_WORKER), axis=1)
+        work = partial(_captions, dataset, tokenizer.group_frames, face, min_frames)
+        with Workers(min(len(parts), usable_cores())) as workers:
+            done = [found for _, found in sorted(workers.run(work, parts), key=itemgetter(0))]
         # Equal captions share one row of the text embeddings.
         rows: dict[str, int] = {}
-        captions = []
-        for index, groups in zip(clips.tolist(), store.groups[clips].tolist(), strict=True):
-            clip_captions = captions_of(dataset, index, face=face)
-            frames = int(dataset.frames[index])
-            spans = caption_spans(clip_captions, dataset.layout.fps, frames, min_frames)
-            captions.append([_caption(span, groups, tokenizer.group_frames, rows) for span in spans])
-        return {**vars(TokenCaptions.of(captions, clips)), **of_texts(list(rows))}
+        for texts, _, captions in done:
+            own = np.array([rows.setdefault(text, len(rows)) for text in texts], dtype=np.int64)
+            captions[:, 0] = own[captions[:, 0]]
+            texts.clear()
+        counts, captions = (np.concatenate([found[k] for found in done]) for k in (1, 2))
+        return {**vars(TokenCaptions.of(counts, captions, clips)), **of_texts(list(rows))}
 
     tables = read() if note is None else made_once(note, read)
     own = TokenCaptions(**{field.name: tables.pop(field.name) for field in fields(TokenCaptions)})
@@ -340,11 +344,25 @@ def gpt_clips(
     )
 
 
-def _caption(span: CaptionSpan, groups: int, unit: int, rows: dict[str, int]) -> tuple[int, int, int]:
-    """Row, first group and number of the groups whose borders are nearest to the caption's, at least one."""
-    first = min((span.first + unit // 2) // unit, groups - 1)
-    end = min(max((span.end + unit // 2) // unit, first + 1), groups)
-    return rows.setdefault(span.text, len(rows)), first, end - first
+def _captions(
+    dataset: ClipDataset, unit: int, face: bool, min_frames: int, clips: NDArray[np.int64]
+) -> tuple[list[str], NDArray[np.int64], NDArray[np.int64]]:
+    """Different captions of clips, (number, groups) [2, n]; how many each has; and of each its row in the
+    first, first group and number of the groups whose borders, `unit` frames apart, are nearest to it, at
+    least one.
+    """
+    rows: dict[str, int] = {}
+    counts = []
+    out = []
+    for index, groups in clips.T.tolist():
+        captions = captions_of(dataset, index, face=face)
+        spans = caption_spans(captions, dataset.layout.fps, int(dataset.frames[index]), min_frames)
+        counts.append(len(spans))
+        for span in spans:
+            first = min((span.first + unit // 2) // unit, groups - 1)
+            end = min(max((span.end + unit // 2) // unit, first + 1), groups)
+            out.append((rows.setdefault(span.text, len(rows)), first, end - first))
+    return list(rows), np.array(counts, dtype=np.int64), np.array(out, dtype=np.int64).reshape(-1, 3)
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,8 @@ from motionloom.models.tokenizer.base import Tokenizer, TokenizerConfig
 from motionloom.models.tokenizer.body_hand import H2VQConfig
 from motionloom.models.tokenizer.single import RvqConfig, VqConfig
 from motionloom.pipeline.evaluation.estimate import row_estimates
-from motionloom.pipeline.evaluation.reconstruction import face_errors, reconstruction_errors
+from motionloom.pipeline.evaluation.reconstruction import clip_errors, face_errors
+from motionloom.pipeline.evaluation.reference_baselines import NearestClip
 from motionloom.pipeline.evaluation.truth import Truth, has_caption, reconstruct_truth, spread, truth_of
 from motionloom.pipeline.store.networks import TrainedTokenizer
 from motionloom.pipeline.store.tokens import GptClips, TokenBatches, TokenStore, gpt_clips
@@ -106,6 +107,15 @@ def test_gpt_batches_say_which_tokens_were_recorded(data: Data) -> None:
             hand = torch.from_numpy(np.isin(net.columns.numpy(), dataset.layout.part("hand")))
             assert torch.equal(batch["present"][row], torch.full_like(hand, True) if hands[text] else ~hand)
     assert {hands[text] for text in seen} == {True, False}
+
+
+def reconstruction_errors(
+    trained: TrainedTokenizer, dataset: ShardDataset, truths: Sequence[Truth]
+) -> dict[str, float]:
+    """Mean errors over all clips of `truths` in mm."""
+    pairs = zip(truths, NearestClip(dataset).motions(truths), strict=True)
+    rows = [clip_errors(trained, near, truth, reconstruct_truth(trained, truth)) for truth, near in pairs]
+    return {name: one.value for name, one in row_estimates([rows]).items()}
 
 
 def test_figures_do_not_depend_on_what_was_not_recorded(data: Data) -> None:
