@@ -150,21 +150,23 @@ def report(
     command: str | None = None,
 ) -> None:
     """Print the table of rows and, where it has a name, write its record."""
-    record = {"title": title, "columns": [column._asdict() for column in columns], "rows": list(rows)}
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, cwd=HERE)
+    versions = {package: version(package) for package in ("torch", "numpy")}
+    record = {
+        "measured": f"{datetime.now(UTC):%Y-%m-%d}",
+        "commit": commit.stdout.decode().strip(),
+        "command": command or f"python benchmarks/{Path(sys.argv[0]).name} {shlex.join(sys.argv[1:])}",
+        "versions": {"python": platform.python_version()} | versions,
+        "cpu_seconds": round(process_seconds()),
+        "device": torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU",
+        "code": {kind.name: kind.version for kind in KINDS.imported()},
+        "title": title,
+        "columns": [column._asdict() for column in columns],
+        "rows": list(rows),
+    }
     if name is not None:
-        commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, cwd=HERE)
         path = RECORDS / f"{name}.json"
-        versions = {package: version(package) for package in ("torch", "numpy")}
-        facts = {
-            "measured": f"{datetime.now(UTC):%Y-%m-%d}",
-            "commit": commit.stdout.decode().strip(),
-            "command": command or f"python benchmarks/{Path(sys.argv[0]).name} {shlex.join(sys.argv[1:])}",
-            "versions": {"python": platform.python_version()} | versions,
-            "cpu_seconds": round(process_seconds()),
-            "device": torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU",
-            "code": {kind.name: kind.version for kind in KINDS.imported()},
-        }
-        path.write_text(json.dumps(facts | record, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        path.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
         print(path)
     print(f"{title}\n\n{table_of(record)}")
 

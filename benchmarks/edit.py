@@ -171,10 +171,11 @@ def figures_of(
         return []
     for (made,) in draws:
         near = made.report
-        figures = measured(made.joints, clip.joints, fps, gap)
-        if "seconds" in task:
+        if "seconds" in task:  # as long as the words' own clip, not the recording
             figures = {"sliding": near.sliding, **obeyed(made.joints, words, fps, gap.start)}
-        elif "pins" in task:
+        else:
+            figures = measured(made.joints, clip.joints, fps, gap)
+        if "pins" in task:
             figures["pin"] = float(np.mean(list(near.pins_cm.values())))
         out.append({name: value for name, value in figures.items() if np.isfinite(value)})
     return out
