@@ -195,9 +195,11 @@ def row_of(run: Path, table: Table, title: str) -> Record:
             if value is not None:
                 cells.setdefault(column.figure, []).append(value)
         if found and row == MODEL:
-            model = finished_records(run).get(found.about.get("made_by", {}).get("generator", ""))
-            protocol |= {"steps": steps_of(model)}
-            for made in (finished_records(run).get(folder.name), model):
+            records = finished_records(run)
+            model = records.get(found.about.get("made_by", {}).get("generator", ""))
+            own = records.get(folder.name)
+            protocol |= {"steps": steps_of(model or (own.inputs.get("tokenizer") if own else None))}
+            for made in (own, model):
                 for one in (made, *made.upstream()) if made else ():
                     code[one.kind] = one.version
                     settings[one.name] = settings_digest(one.kind, one.config)
