@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from motionloom.datasets.actions.signals import STAND
 from motionloom.datasets.synth.actions.arms import Vec, slerp, to_point
@@ -66,15 +67,15 @@ def settle(track: Track, shortest: float, rng: np.random.Generator) -> Track:
     return track.cut(begin, end - begin)
 
 
-def _moving(track: Track) -> Array:
+def _moving(track: Track) -> NDArray[np.bool_]:
     """Whether [T, 3] the left wrist, the right one and anything else move."""
     joints = track.solve()[:, :22]
     speed = np.linalg.norm(np.gradient(joints, axis=0), axis=-1) * track.fps
     others = np.delete(speed, [18, 19, 20, 21], axis=1).max(1)
-    return np.stack([speed[:, 20], speed[:, 21], others], axis=1) > _MOVES
+    return np.asarray(np.stack([speed[:, 20], speed[:, 21], others], axis=1) > _MOVES)
 
 
-def _stand(track: Track, moving: Array, last: bool, rng: np.random.Generator) -> None:
+def _stand(track: Track, moving: NDArray[np.bool_], last: bool, rng: np.random.Generator) -> None:
     """Take one idle pose at the beginning or, `last`, at the end of a track."""
     names = [str(rng.choice(_BOTH))] * 2 if rng.random() < 0.35 else list(rng.choice(("", "hip", "thigh"), 2))
     for side, name in enumerate(names):
@@ -90,7 +91,7 @@ def _stand(track: Track, moving: Array, last: bool, rng: np.random.Generator) ->
         arm.roll = arm.roll + weight * (roll - arm.roll)
         arm.flex = arm.flex + weight * (flex - arm.flex)
     # The weight is on one leg, the hip above it higher, and she looks somewhere.
-    weight = _fade(track, moving.any(1), last)
+    weight = _fade(track, np.asarray(moving.any(1)), last)
     shift = rng.uniform(-0.05, 0.05)
     track.root += (
         weight[:, None]
@@ -102,7 +103,7 @@ def _stand(track: Track, moving: Array, last: bool, rng: np.random.Generator) ->
     track.head[:, :2] += weight[:, None] * rng.normal(0.0, (0.06, 0.2))
 
 
-def _fade(track: Track, busy: Array, last: bool) -> Array:
+def _fade(track: Track, busy: NDArray[np.bool_], last: bool) -> Array:
     """A weight [T] that is 1 until half of `RELAXED` before one moves, and 0 from half of it after that."""
     if last:
         return _fade(track, busy[::-1], False)[::-1]

@@ -129,7 +129,8 @@ class TokenCaptions:
     @staticmethod
     def of(counts: NDArray[np.int64], captions: NDArray[np.int64], clips: NDArray[np.int64]) -> TokenCaptions:
         """So many of the `captions`, (row, first, count) [m, 3], are of each of the `clips`."""
-        return TokenCaptions(np.append(0, counts.cumsum()), *captions.T.copy(), clips)
+        rows, first, count = captions.T.copy()
+        return TokenCaptions(np.append(0, counts.cumsum()), rows, first, count, clips)
 
 
 @dataclass(frozen=True)
