@@ -216,7 +216,7 @@ def test_rows_of_older_code_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     assert f"*Of older code: b ({now_is}); c (of commit 1234567);" in results.table_of(record)
 
 
-OLDER = {"alignment", "dmd", "negative_filter", "rivals"}
+OLDER = {"dmd", "negative_filter", "rivals"}
 """Records with rows of older code, which the page says: to be measured again, or deleted."""
 
 
