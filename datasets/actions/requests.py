@@ -1,4 +1,4 @@
-"""What a caption asks for, as whoever is registered to read captions says; nothing where nobody is."""
+"""Requests of captions, by whoever is registered to read captions; none where nobody is."""
 
 from __future__ import annotations
 

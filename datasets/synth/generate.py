@@ -74,7 +74,7 @@ ANIMATORS: dict[str, Animator] = {
     "stretch": arms.lift,
 }
 UNPACED = ("jump", "hop", "run", "dance")
-"""What gravity or music paces."""
+"""Actions at the pace of gravity or of music."""
 
 
 class SynthConfig(Config):

@@ -1,8 +1,4 @@
-"""Parse captions for the actions of the synthetic source, by patterns of English [ours].
-
-A linear probe on sentence embeddings was tried in its place; the
-figures of both are in docs/results.md.
-"""
+"""Parse captions for the actions of the synthetic source, by patterns of English [ours]."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ from motionloom.pipeline.store.files import made_once
 
 Codes = dict[str, Tensor]
 _OF_A_WORKER = 2**15
-"""Clips whose captions a process of its own reads: it takes seconds to start."""
+"""Clips whose captions a process of its own reads, one of at most eight, as each takes 300 MB to start."""
 
 
 @dataclass(frozen=True)
@@ -320,7 +320,7 @@ def gpt_clips(
     def read() -> dict[str, Any]:
         parts = np.array_split(np.stack([clips, store.groups[clips]]), -(-len(clips) // _OF_A_WORKER), axis=1)
         work = partial(_captions, dataset, tokenizer.group_frames, face, min_frames)
-        with Workers(min(len(parts), usable_cores())) as workers:
+        with Workers(min(8, usable_cores())) as workers:
             done = [found for _, found in sorted(workers.run(work, parts), key=itemgetter(0))]
         # Equal captions share one row of the text embeddings.
         rows: dict[str, int] = {}

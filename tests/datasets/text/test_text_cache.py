@@ -51,7 +51,7 @@ def test_minilm_is_what_sentence_transformers_makes_of_it() -> None:
 
 
 def test_a_side_or_a_pace_alone_is_the_same_meaning_to_the_papers_filter() -> None:
-    """What docs/results.md says of captions that TMA's filter of .85 never tells apart."""
+    """docs/results.md says so: TMA's filter of .85 never tells such captions apart."""
     pairs = (("with the left hand", "with the right hand", 0.98), ("slowly", "quickly", 0.93))
     for one, other, alike in pairs:
         verb = "waves" if "hand" in one else "walks forward"

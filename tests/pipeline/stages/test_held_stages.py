@@ -109,6 +109,21 @@ def test_gpt_batches_say_which_tokens_were_recorded(data: Data) -> None:
     assert {hands[text] for text in seen} == {True, False}
 
 
+@pytest.mark.parametrize("cores", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_captions_are_the_same_however_many_read_them(
+    data: Data, monkeypatch: pytest.MonkeyPatch, cores: int
+) -> None:
+    net, (dataset, stats) = tokenizer(data), data[0]
+    store = encode_split(net, dataset, stats, 256)
+    one = gpt_clips(dataset, store, net, face=False, min_frames=16)
+    monkeypatch.setattr("motionloom.pipeline.store.tokens._OF_A_WORKER", 3)
+    monkeypatch.setattr("motionloom.pipeline.store.tokens.usable_cores", lambda: cores)
+    other = gpt_clips(dataset, store, net, face=False, min_frames=16)
+    assert other.texts == one.texts and len(one.texts) > 3
+    for name, values in vars(one.captions).items():
+        np.testing.assert_array_equal(getattr(other.captions, name), values)
+
+
 def reconstruction_errors(
     trained: TrainedTokenizer, dataset: ShardDataset, truths: Sequence[Truth]
 ) -> dict[str, float]:
